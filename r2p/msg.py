@@ -8,7 +8,7 @@ classes that are not the firmware's say how many their message takes.
 
 from typing import Annotated, ClassVar
 
-from r2p.messages import Array, Len, Max, Message, f32, f64, i16, i32, u8, u16, u32, u64
+from r2p.messages import Array, Len, Max, Message, f32, f64, i8, i16, i32, u8, u16, u32, u64
 from r2p.messages import Duration as Duration  # as Timestamp
 from r2p.messages import Timestamp as Timestamp  # a part of the standard messages: imported from here
 
@@ -387,6 +387,51 @@ class GatewayStatus(Message):
     dropped: u64 = 0
     rate: f32 = 0.0
     """Messages in the last second."""
+
+
+class BusLoad(Message):
+    """What a topic of a module took of an RTCAN bus in the last second (topic `bus_load`), stuff bits included.
+
+    There is one message for each topic of each module, and one for the whole bus, with `kind` "total". They are sent
+    while the topic has subscribers, by one module of the bus.
+    """
+
+    bus: Annotated[str, Max(32)] = ""
+    """The link of the module that measures: rtcan:can0."""
+    kind: Annotated[str, Max(10)] = ""
+    """The kind of frames: sync, hrt, srt, nrt, management, other; or total."""
+    topic: Annotated[str, Max(72)] = ""
+    module: Annotated[str, Max(64)] = ""
+    """The module that sends it."""
+    share: f32 = 0.0
+    """Of the time; 1.0 is all of it."""
+    frames: f32 = 0.0
+    """A second."""
+    errors: u32 = 0
+    """Error frames, and other faults that the interface reports; of the whole bus only, as what follows."""
+    reserved: f32 = 0.0
+    """Share of the time that is reserved for slots."""
+    free_used: f32 = 0.0
+    """Used part of the other slots; above 0.8 events wait long."""
+
+
+class BusSlots(Message):
+    """The slots of a periodic topic on an RTCAN bus (topic `bus_slots`).
+
+    There is one message for each topic of each module, also of the master's sync, and one without a topic for slots
+    that are reserved and not used. All are sent to each new subscriber, and one when its slots have changed.
+    """
+
+    bus: Annotated[str, Max(32)] = ""
+    """The link of the module that watches: rtcan:can0."""
+    topic: Annotated[str, Max(72)] = ""
+    module: Annotated[str, Max(64)] = ""
+    """The module that owns the slots."""
+    slots: Annotated[tuple[i8, ...], Max(64)] = ()
+    """Their numbers, 0 is the sync; empty, if it has none any more."""
+    slots_in_cycle: u8 = 0
+    cycle: f32 = 0.0
+    """s."""
 
 
 # ROS's, with its names, fields and bytes (those of ROS 1), for data whose length varies. Their bounds, `r2p.Max`, are

@@ -44,6 +44,8 @@ RESERVED = (MANAGEMENT, CALLS, REPLIES)
 """The topics that programs can't use."""
 LOG = "log"
 """The topic on which each r2p module publishes the log records of its nodes."""
+BUS_LOAD, BUS_SLOTS = "bus_load", "bus_slots"
+"""The topics on which a module of an RTCAN bus publishes what is on the bus, while they are subscribed."""
 LOADER_PREFIX = "BOOT_"
 """The topics of boot loaders begin with this; the module's name follows."""
 

@@ -87,6 +87,8 @@ class DiscoveryProtocol(ABC):
 
     def __init__(self, module: str, instance: int, counts: Counter[str] | None, names: LinkNames) -> None:
         self.flags = 0
+        self.is_gateway = False
+        """True once this module is announced as a gateway."""
         self.counts = Counter() if counts is None else counts
         self._module = module
         self._instance = instance
@@ -203,6 +205,7 @@ class DiscoveryProtocol(ABC):
 
     def announce_gateway(self) -> None:
         """Announce from now on that this module is a gateway; for networks where messages do not name their sender."""
+        self.is_gateway = True
 
     # What users and gateways ask for
 
@@ -420,7 +423,7 @@ class Discovery(DiscoveryProtocol):
         return self._flush(now)
 
     def announce_gateway(self) -> None:
-        self._announcer.is_gateway = True
+        self.is_gateway = self._announcer.is_gateway = True
 
     # What users and gateways ask for
 

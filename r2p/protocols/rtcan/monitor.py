@@ -63,12 +63,16 @@ class TrafficCount(msgspec.Struct):
 
 
 class BusSlot(msgspec.Struct):
-    """One slot over all watched cycles: how often it was reserved, had an HRT frame, or another one; by topic."""
+    """One slot over all watched cycles: how often it was reserved, had an HRT frame, or another one; by topic.
+
+    `senders` has its HRT frames by topic and module.
+    """
 
     reserved: int = 0
     used: int = 0
     shared: int = 0
     owners: Counter[str] = msgspec.field(default_factory=Counter)
+    senders: Counter[tuple[str, str]] = msgspec.field(default_factory=Counter)
 
     @property
     def missed(self) -> int:
@@ -80,7 +84,8 @@ class BusLoad(msgspec.Struct, frozen=True):
     """The load of the bus in `elapsed` ns; shares are of the time: 1.0 is all of it.
 
     `free` is the share without reservation, `free_frames` how many frames of full length fit in there. `nrt_gap` is
-    the longest time without a non real-time frame (ns); None if there was none at all.
+    the longest time without a non real-time frame (ns); None if there was none at all. `slots` are those of the whole
+    cycles in that time.
     """
 
     elapsed: int
@@ -90,6 +95,7 @@ class BusLoad(msgspec.Struct, frozen=True):
     reserved: float
     free_frames: float
     nrt_gap: int | None
+    slots: list[BusSlot] = []
 
     def share(self, bits: int) -> float:
         """Return bits as a share of the time."""
@@ -163,6 +169,10 @@ class BusDirectory:
         """Return the module that uses a message id."""
         id8 = rtcan.id8_of(message)
         return self.modules.get(id8, f"id {id8}") if id8 else "?"
+
+    def names(self, message: int) -> tuple[str, str]:
+        """Return topic and module of a message id."""
+        return self.topic(message), self.module(message)
 
 
 class Monitor:
@@ -279,9 +289,11 @@ class Monitor:
     def slots(self) -> list[BusSlot]:
         """Return the use of each slot since the last `reset`, with the names known by now."""
         for slot, owners in zip(self._slots, self._owners, strict=True):
-            slot.owners = Counter()
+            slot.owners, slot.senders = Counter(), Counter()
             for message, count in owners.items():
-                slot.owners["sync" if message == _SYNC else self.directory.topic(message)] += count
+                topic, module = ("sync", "") if message == _SYNC else self.directory.names(message)
+                slot.owners[topic] += count
+                slot.senders[topic, module] += count
         return self._slots
 
     def load(self, now: int) -> BusLoad:
@@ -293,7 +305,7 @@ class Monitor:
         tallies: dict[tuple[str, str, FrameKind], TrafficCount] = {}
         for (message, kind), tally in self._tallies.items():
             nameless = kind is FrameKind.SYNC or kind is FrameKind.OTHER
-            names = ("", "") if nameless else (self.directory.topic(message), self.directory.module(message))
+            names = ("", "") if nameless else self.directory.names(message)
             total = tallies.setdefault((*names, kind), TrafficCount())
             total.frames += tally.frames
             total.bits += tally.bits
@@ -301,7 +313,7 @@ class Monitor:
         reserved = min(1.0, self._reserved * timing.slot / elapsed) if elapsed else 0.0
         longest = (can_bits.frame_bits_max(rtcan.FRAME_MAX) + can_bits.INTERMISSION) * timing.bit
         free = (1.0 - reserved) * elapsed / timing.slot * (timing.slot // longest) if self._reserved else 0.0
-        return BusLoad(elapsed, timing.bit, tallies, dict(self._faults), reserved, free, gap)
+        return BusLoad(elapsed, timing.bit, tallies, dict(self._faults), reserved, free, gap, self.slots)
 
     def _begin_cycle(self, start: int, frame: Frame) -> None:
         sync = rtcan.decode_sync(frame)

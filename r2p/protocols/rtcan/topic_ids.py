@@ -92,6 +92,11 @@ class TopicIdAllocator:
             moved.append(topic)
         return moved
 
+    def topics(self, own_id8: int) -> dict[int, str]:
+        """Return all topics on the bus that are known, by message id; those of this module under its id8."""
+        ours = {rtcan.message_id(high, own_id8): topic for topic, high in self._ours.items()}
+        return {message: each.topic for message, each in self._announced.items()} | ours
+
     def on_module_gone(self, id8: int) -> None:
         """Forget the module with this id8, which left."""
         for message in [each for each in self._announced if rtcan.id8_of(each) == id8]:

@@ -7,7 +7,8 @@
 Consequences of an action come after the actions before it: a port may confirm from within `transmit`, and the owner may
 publish from within `act`. Both end in `carry_out`, which then only queues.
 
-`UtcEstimator` translates the engine's network time to UTC.
+A `Monitor` may watch: it gets every frame on the bus, this node's own ones as they are confirmed. `UtcEstimator`
+translates the engine's network time to UTC.
 """
 
 import asyncio
@@ -21,6 +22,7 @@ from r2p.messages import ClockOffset
 from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action
+from r2p.protocols.rtcan.monitor import Monitor
 from r2p.transports.can.port import CanPort
 from r2p.transports.stats import RETRY_AFTER_ERROR
 
@@ -70,6 +72,8 @@ class EngineDriver:
         self._timer = port.alarm(self._poll)
         self._actions: deque[Action] = deque()
         self._acting = False
+        self._monitor: Monitor | None = None
+        self._watched: dict[Mailbox, Frame] = {}  # this node's frames in mailboxes, while there is a monitor
         self._pending: Callable[[], object] = lambda: engine.waiting
         self._drained: asyncio.Future[None] | None = None
 
@@ -78,12 +82,16 @@ class EngineDriver:
 
     def on_frame(self, frame: Frame, stamp: int) -> None:
         try:
+            if self._monitor is not None:
+                self._monitor.frame(frame, stamp - self.port.receive_latency)
             self.carry_out(self.engine.receive(self.now(), frame, stamp))
         except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
             self._failed(error)
 
     def on_confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         try:
+            if self._monitor is not None:
+                self._count_own(self._monitor, mailbox, outcome, at)
             self.carry_out(self.engine.confirm(self.now(), mailbox, outcome, at))
         except Exception as error:  # noqa: BLE001 - counted and logged; the next confirmation follows
             self._failed(error)
@@ -114,10 +122,13 @@ class EngineDriver:
         self._owner.bus_waits(reason)
 
     def on_fault(self, kind: str) -> None:
+        if self._monitor is not None:
+            self._monitor.fault(kind)
         self._owner.bus_fault(kind)
 
     def on_other_frame(self, frame: OtherFrame, stamp: int) -> None:
-        pass  # it does not concern RTCAN
+        if self._monitor is not None:  # to RTCAN it is of no concern
+            self._monitor.other(frame, stamp - self.port.receive_latency)
 
     # Act, and re-arm the timer
 
@@ -154,8 +165,24 @@ class EngineDriver:
     # For the owner
 
     def update_filters(self) -> None:
-        """Pass the engine's new filters to the port."""
-        self.port.set_filters(self.engine.filters())
+        """Pass the engine's new filters to the port; none while a monitor watches."""
+        self.port.set_filters(self.engine.filters() if self._monitor is None else None)
+
+    def watch(self, monitor: Monitor | None) -> None:
+        """Let a monitor count what is on the bus from now on, instead of the one before; None: no longer."""
+        self._monitor = monitor
+        self._watched.clear()
+        self._port_actions[Transmit] = self.port.transmit if monitor is None else self._transmit_watched
+        self.update_filters()
+
+    def _transmit_watched(self, order: Transmit) -> None:
+        self._watched[order.mailbox] = order.frame
+        self.port.transmit(order)
+
+    def _count_own(self, monitor: Monitor, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
+        frame = self._watched.pop(mailbox, None)
+        if frame is not None and outcome is Outcome.SENT:
+            monitor.frame(frame, at)
 
     async def drain(self, timeout: float, pending: Callable[[], object] | None = None) -> None:
         """Wait until nothing is `pending` (default: in the engine's send queues), at most `timeout` seconds."""

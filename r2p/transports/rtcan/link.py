@@ -330,6 +330,10 @@ class RtcanLink(BufferedLink):
             return None
         return management.rtcan_params(rtcan.message_id(high, self.engine.id8 or 0))
 
+    def topics_on_bus(self) -> dict[int, str]:
+        """Return the topics of the bus by message id, this module's and those that others have announced."""
+        return self._topic_ids.topics(self.engine.id8 or 0)
+
     def topic_changed(self, topic: Topic) -> None:
         refused = self._topic_ids.refused
         known = topic.name in refused

@@ -16,6 +16,7 @@ from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import EngineSettings, Profile
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, Transport
+from r2p.transports.rtcan.bus_topics import BusReporter
 from r2p.transports.rtcan.link import RtcanLink
 from r2p.transports.url import Url, duration, key_file
 from r2p.units import SECOND
@@ -116,10 +117,12 @@ async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanP
     link.use_key(options.key)
     hub.attach(link)
     running = asyncio.create_task(port.run(link.driver, opened), name=f"{name} port")
+    reporter = BusReporter(link, hub)
     try:
         await asyncio.wait([running])  # unlike `await running`, this does not cancel the port when it is cancelled
         await running
     finally:
+        reporter.close()
         try:
             if not running.done():  # else the port has failed, and sends nothing any more
                 await link.drain(_DRAIN_TIMEOUT)
