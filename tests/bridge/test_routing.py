@@ -54,7 +54,8 @@ async def test_a_topic_that_no_other_link_can_name_is_not_relayed(name: str) -> 
         tap = Tap("b")
         script.hear(manage(management.Advertise(name, 5)))
         await asyncio.sleep(1.0)
-        assert not [each for each in tap.heard if isinstance(each, management.Advertise)]
+        advertised = {each.topic for each in tap.heard if isinstance(each, management.Advertise)}
+        assert advertised <= {"log"}
         assert name not in module.space.topics
 
 
@@ -79,7 +80,7 @@ async def test_what_was_forwarded_as_an_alias_is_forwarded_by_its_name_once_that
         assert names[:2] == management.long_name_messages(management.KIND_TOPIC, name)
         b.heard.clear()
         say(a, management.Hello("A", 7), management.Advertise(alias, 5))
-        await asyncio.sleep(1.0)
+        await asyncio.sleep(2.0)
         assert alias in {each.topic for each in b.heard if isinstance(each, management.Advertise)}
         assert set(module.space.topics) == {name, "log"}
 
