@@ -334,7 +334,7 @@ async def test_an_order_without_a_prefix_does_not_ask_for_all_modules(monkeypatc
 
 
 async def test_control_from_ip_links_needs_permission(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"memory"}))
+    monkeypatch.setattr("r2p.transports.url._IP", frozenset({"memory"}))
     for allowed in (False, True):
         async with gateway(BridgeOptions(allow_control=allowed)) as gw:
             a, b = Tap("a"), Tap("b")
@@ -361,7 +361,7 @@ async def test_who_gives_an_order_that_does_not_pass_is_told(
     options: BridgeOptions, command: Command, missing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through another gateway, too; and no other module is."""
-    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"memory"}))
+    monkeypatch.setattr("r2p.transports.url._IP", frozenset({"memory"}))
     async with (
         gateway(options),
         gateway(BridgeOptions(allow_control=True), name="G2", networks="bc"),

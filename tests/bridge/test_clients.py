@@ -189,7 +189,7 @@ async def test_a_client_by_which_a_probe_comes_back_is_a_gateway_of_firmware() -
 async def test_orders_that_are_refused_are_logged_once_a_second(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"script"}))
+    monkeypatch.setattr("r2p.transports.url._IP", frozenset({"script"}))
     client = Client()
     caplog.set_level(logging.WARNING)
     async with r2p.Module("GW", via=["memory:a", client], bridge=True) as gw:
@@ -207,7 +207,7 @@ async def test_orders_that_are_refused_are_logged_once_a_second(
 async def test_a_gateway_obeys_what_it_lets_through(
     allowed: bool, obeys: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"script"}))
+    monkeypatch.setattr("r2p.transports.url._IP", frozenset({"script"}))
     client = Client()
     async with r2p.Module("GW", via=["memory:a", client], bridge=r2p.BridgeOptions(allow_control=allowed)) as gw:
         await asyncio.sleep(CONVERGED)

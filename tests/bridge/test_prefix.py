@@ -139,7 +139,7 @@ async def test_modules_of_the_network_are_seen_by_the_robot_unless_it_has_one_of
 
 
 async def test_who_orders_what_is_denied_is_told_the_long_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"memory"}))
+    monkeypatch.setattr("r2p.transports.url._IP", frozenset({"memory"}))
     async with robots("robot1"), r2p.Module("PC", via="memory:lab") as pc:
         events = pc.events()
         await asyncio.sleep(1)
