@@ -10,10 +10,10 @@ from collections.abc import Hashable
 from r2p.bridge.forwarding import HOPS_MAX, BridgePort
 from r2p.bridge.options import Policy
 from r2p.clock import Clock
-from r2p.codecs import own_services, services
+from r2p.codecs import own_services
 from r2p.codecs.management import DENIED_CONTROL, DENIED_READ_ONLY
-from r2p.codecs.own_services import PAGE_MAX, OwnCall
-from r2p.codecs.services import Kind, ServiceHeader
+from r2p.codecs.own_services import OwnCall
+from r2p.codecs.services import Kind
 from r2p.log_lines import get_logger
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.transports.link import Link
@@ -40,6 +40,10 @@ class CallRelay:
     def is_read_only(self, link: Link) -> bool:
         """Return whether nothing may go onto a link, so that nothing may be changed from there either."""
         return self._policy.is_read_only(link.name)
+
+    def passes_on(self, link: Link, call: OwnCall) -> bool:
+        """Return whether it is this gateway that passes on a message of a link, or refuses it."""
+        return self._way_to(self._ports[link.name], call.target, self._clock.monotonic()) is not None
 
     def forward(self, link: Link, call: OwnCall, data: bytes, source: Hashable) -> None:
         """Pass on a message that came by a link, from this address, for another module; or count why not."""
@@ -87,9 +91,7 @@ class CallRelay:
             return
         if call.changes and (more := port.refusal_lines.suffix("changes", self._clock.monotonic())) is not None:
             logger.warning("link %s: %s%s", port.link.title, refusal, more)
-        header = ServiceHeader(call.header.instance, call.header.number, Kind.ERROR, call.target)
-        answer = OwnCall(header, call.operation, call.page, body=services.encode_text(refusal, PAGE_MAX))
-        port.link.calls.send(own_services.encode(answer), source)
+        port.link.calls.send(own_services.refusal(call, refusal), source)
 
     def _way_to(self, port: BridgePort, instance: int, now: int) -> BridgePort | None:
         """Return the port behind which a module is, in the tree; None if it is on the side where the message came from,

@@ -47,6 +47,7 @@ PAGE_MAX = MESSAGE_MAX - _SIZE
 
 _TO_SERVER = (Kind.REQUEST, Kind.CANCEL)
 _KIND = 6  # in the header
+_OPERATION = HEADER_SIZE + 1
 _TOPICS = (REPLIES.encode(), CALLS.encode())
 
 
@@ -114,6 +115,17 @@ def decode(data: bytes) -> OwnCall:
 def topic_of(data: bytes) -> bytes:
     """Return the topic of an encoded message."""
     return _TOPICS[data[_KIND] in _TO_SERVER]
+
+
+def is_change(data: bytes) -> bool:
+    """Return whether bytes may be a request that changes something, which needs a seal on a link with a key."""
+    return len(data) >= _SIZE and data[_KIND] in _TO_SERVER and data[_OPERATION] >= CHANGES
+
+
+def refusal(call: OwnCall, text: str) -> bytes:
+    """Encode the answer to a request that this module, or a gateway in the place of the called one, refuses."""
+    header = ServiceHeader(call.header.instance, call.header.number, Kind.ERROR, call.header.server)
+    return encode(OwnCall(header, call.operation, call.page, body=services.encode_text(text, PAGE_MAX)))
 
 
 def with_hops(data: bytes, hops: int) -> bytes:

@@ -80,6 +80,10 @@ _DENIED = {
     DENIED_READ_ONLY: "the link there is read-only",
     DENIED_BOOT: "the module is in its boot loader, where a STOP hangs its management until its power is cut",
 }
+_CHANGE_DENIED = {
+    DENIED_NO_KEY: "the link has a key: add ?key=FILE to the URL",
+    DENIED_OTHER_KEY: "the link has another key than the sender: give both ends copies of one file",
+}
 
 
 class _RefusedLink(msgspec.Struct, eq=False):
@@ -282,6 +286,16 @@ class LinkManager:
     def concerns_order(self, module: str) -> bool:
         """Return whether an order for this module (by its alias) is to be obeyed or passed on here."""
         return self.bridge is not None or module == module_alias(self.space.module)
+
+    def concerns_call(self, link: Link, data: bytes) -> bool:
+        """Return whether a request that changes something is to be handled or passed on here."""
+        return self.own_services.concerns(link, data)
+
+    def call_refused(self, link: Link, data: bytes, source: Hashable, verdict: Verdict) -> None:
+        """Refuse a request that does not count, as it lacks the link's key."""
+        reason = _KEY_REASONS[verdict]
+        self._report_key(link, "changes refused", reason)
+        self.own_services.refuse(link, data, source, _CHANGE_DENIED[reason])
 
     def message_refused(self, link: Link, message: management.Management, verdict: Verdict) -> None:
         """Report that an order, or a message of a gateway, does not count, as it lacks the link's key."""

@@ -240,6 +240,22 @@ class OwnServices:
         else:
             self._handle(link, call, data, source)
 
+    def concerns(self, link: Link, data: bytes) -> bool:
+        """Return whether a request that came by a link is for this module, or for one to which it passes it on."""
+        try:
+            call = own_services.decode(data)
+        except DecodeError:
+            return False  # `receive` counts it
+        return call.target == self._instance or (self.relay is not None and self.relay.passes_on(link, call))
+
+    def refuse(self, link: Link, data: bytes, source: Hashable, reason: str) -> None:
+        """Answer a request that lacks the key of the link by which it came."""
+        call = own_services.decode(data)
+        if call.header.kind is Kind.REQUEST and link.up and not link.calls.full:
+            module = self._space.module if call.target == self._instance else f"gateway {self._space.module}"
+            text = f"{module} refuses changes from {scheme_of(link.name)}: {reason}"
+            link.calls.send(own_services.refusal(call, text), source)
+
     def _handle(self, link: Link, call: OwnCall, data: bytes, source: Hashable) -> None:
         if call.target != self._instance:
             if self.relay is not None:
@@ -339,7 +355,7 @@ class OwnServices:
         suffix = self._refusals.suffix(link.name, self._clock.monotonic())
         if suffix is not None:
             logger.warning("link %s: %s%s", link.title, refusal, suffix)
-        return self._reply(call, Kind.ERROR, services.encode_text(refusal, PAGE_MAX))
+        return own_services.refusal(call, refusal)
 
     def _error(self, link: Link, call: OwnCall, error: Exception) -> bytes:
         """Return the answer with the text of an error."""

@@ -1,11 +1,12 @@
 """One module's part in proving a shared key on one link (PROTOCOL.md 9).
 
-A session is the time from one start of the link to the next. Its sender seals each order and each message between
-gateways, under a counter that grows. A receiver believes a seal once it knows that the session is no recording: it
-sends a CHALLENGE, whose PROOF says how far the counter has come. So nothing that was recorded counts a second time, and
-what was held back on its way counts for two times PROOF_VALID at most.
+A session is the time from one start of the link to the next. Its sender seals each order, each message between gateways
+and each request that changes something, under a counter that grows. A receiver believes a seal once it knows that the
+session is no recording: it sends a CHALLENGE, whose PROOF says how far the counter has come. So nothing that was
+recorded counts a second time, and what was held back on its way counts for two times PROOF_VALID at most. A message is
+its topic and its bytes.
 
-    sent       seal_order -> SEAL, then the message
+    sent       seal_order, seal -> SEAL, then the message
     received   note_seal, then admit -> Verdict; a CHALLENGE may wait in `pop_messages`
                answer -> PROOF; then `repeat` has the orders that the challenger could not believe yet
                note_proof
@@ -52,6 +53,9 @@ ANSWERS_PERIOD = SECOND // 2
 
 WINDOW = 128
 """Counters up to the last one that are remembered one by one; an earlier one does not count."""
+
+Message = tuple[bytes, bytes]
+"""A topic, and the bytes of a message on it."""
 
 _WINDOW_MASK = (1 << WINDOW) - 1
 _ORDERS_MAX = 8  # orders that may have to be sent again
@@ -136,7 +140,7 @@ class KeyProtocol:
         self._sessions: dict[int, _ProvenSession] = {}
         self._challenged: dict[bytes, tuple[int, int]] = {}  # nonce -> session, time
         self._seals: deque[tuple[int, Hashable, Seal]] = deque(maxlen=SEALS_MAX)  # with their times and senders
-        self._held: deque[tuple[int, Hashable, bytes]] = deque(maxlen=SEALS_MAX)  # messages, in the same way
+        self._held: deque[tuple[int, Hashable, Message]] = deque(maxlen=SEALS_MAX)  # messages, in the same way
         self._orders: deque[_SentOrder] = deque(maxlen=_ORDERS_MAX)
         self._answered: deque[int] = deque(maxlen=ANSWERS_MAX)  # times
         self._messages: list[Challenge] = []
@@ -223,7 +227,7 @@ class KeyProtocol:
             del self._sessions[next(iter(self._sessions))]
         return True
 
-    def note_seal(self, now: int, seal: Seal, source: Hashable) -> tuple[bytes, Verdict] | None:
+    def note_seal(self, now: int, seal: Seal, source: Hashable) -> tuple[Message, Verdict] | None:
         """Keep a seal of this sender for the message behind it; decide about the message if that came before."""
         session = self._sessions.get(seal.session)
         if session is not None and session.is_used(seal.counter):
@@ -236,16 +240,16 @@ class KeyProtocol:
         self._seals.append((now, source, seal))
         return None
 
-    def admit(self, now: int, data: bytes, source: Hashable) -> Verdict:
-        """Decide whether a management message of this sender counts; keep one without a seal for `note_seal`."""
+    def admit(self, now: int, message: Message, source: Hashable) -> Verdict:
+        """Decide whether a message of this sender counts; keep one without a seal for `note_seal`."""
         _expire(self._seals, now)
         for entry in reversed(self._seals):
-            if entry[1] == source and self._fits(entry[2], data):
+            if entry[1] == source and self._fits(entry[2], message):
                 self._seals.remove(entry)
                 return self.judge(now, entry[2])
         if any(sender == source and seal.key != self._key.id for _, sender, seal in self._seals):
             return Verdict.OTHER_KEY
-        self._held.append((now, source, data))
+        self._held.append((now, source, message))
         return Verdict.NO_KEY
 
     def judge(self, now: int, seal: Seal) -> Verdict:
@@ -260,8 +264,12 @@ class KeyProtocol:
             self._challenge_once(now, seal.session)
         return Verdict.ADMITTED if session.use(seal.counter, seal.first) else Verdict.REPEATED
 
-    def _fits(self, seal: Seal, data: bytes) -> bool:
-        return seal.key == self._key.id and keys.is_sealed(self._key, seal, (_TOPIC, data))
+    def has_key(self, seal: Seal) -> bool:
+        """Return whether a seal says that it is of this key; only `admit` shows whether it is."""
+        return seal.key == self._key.id
+
+    def _fits(self, seal: Seal, message: Message) -> bool:
+        return self.has_key(seal) and keys.is_sealed(self._key, seal, message)
 
     def _challenge_once(self, now: int, session: int) -> None:
         if all(of != session or now - at >= CHALLENGE_APART for of, at in self._challenged.values()):

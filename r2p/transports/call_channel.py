@@ -1,5 +1,7 @@
 """Messages of r2p's own services on one link: a rate for those that go out, a limit for those that come in.
 
+On a link with a key, a request that changes something goes out behind its seal, and counts only behind one.
+
 They must not get in the way of data, so the longest of them counts as nine management messages, and the link sends as
 many as its rate allows. What waits is bounded, and a message that is repeated while it waits is sent once.
 """
@@ -9,9 +11,10 @@ from collections.abc import Hashable
 from typing import Any, Protocol
 
 from r2p.clock import Alarm
-from r2p.codecs import call_parts
+from r2p.codecs import call_parts, own_services
 from r2p.codecs.own_services import MESSAGE_MAX
 from r2p.runtime.topic import TopicSpace
+from r2p.transports.guard import LinkGuard
 from r2p.transports.stats import LinkStats
 from r2p.units import SECOND
 
@@ -28,6 +31,7 @@ class CallLink(Protocol):
 
     up: bool
     stats: LinkStats
+    guard: LinkGuard | None
 
     def write_call(self, data: bytes, to: Hashable) -> None:
         """Send a message, to this address at least."""
@@ -92,8 +96,13 @@ class CallChannel:
         self._count += 1
         if self._count > _RECEIVED_MAX:
             self._lost["too many calls"] += 1
-        elif self._link.up:
+        elif self._link.up and self._counts(data, source):
             self._hub.call_received(self._link, data, source)
+
+    def _counts(self, data: bytes, source: Hashable) -> bool:
+        """Return whether a message counts on this link: it may need a seal."""
+        guard = self._link.guard
+        return guard is None or not own_services.is_change(data) or guard.admits_call(data, source, self.duration)
 
     def clear(self) -> None:
         """Forget what waits: the link is down, and callers repeat what they still need."""
@@ -107,6 +116,12 @@ class CallChannel:
         while self._waiting and self._credit > -1e-9:  # which goes below zero: what is cheap need not save up for that
             data, to = self._waiting.popleft()
             self._credit -= call_parts.count(len(data))
-            self._lost.guard(self._link.write_call, data, to)
+            self._lost.guard(self._write, data, to)
         if self._waiting:
             self._alarm.set(now + max(1, round(-self._credit * SECOND / self.rate)))
+
+    def _write(self, data: bytes, to: Hashable) -> None:
+        if self._link.guard is not None and own_services.is_change(data):
+            self._link.guard.seal_call(data)
+            self._credit -= 1
+        self._link.write_call(data, to)

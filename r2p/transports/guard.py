@@ -1,29 +1,46 @@
 """The guard of a link with a shared key: seals what needs it, and refuses what lacks it (PROTOCOL.md 9).
 
-Orders and the messages between gateways count only behind their seal. Everything else passes: on a bus or a network,
-nothing shows who sent it. On a line there is only one other end, so `LineGate` lets the link come up only when that end
-has proven the key.
+Orders, the messages between gateways and requests that change something count only behind their seal. Everything else
+passes: on a bus or a network, nothing shows who sent it. A request is repeated until it is answered, each time with
+another seal. So it is refused only if no seal of its sender arrives: a single one may be lost or late.
+
+On a line there is only one other end, so `LineGate` lets the link come up only when that end has proven the key.
 """
 
 import os
+from collections import deque
 from collections.abc import Callable, Hashable
 from typing import Any, Protocol
 
-from r2p.clock import Alarm, Clock, random_of
+import msgspec
+
+from r2p.clock import Alarm, random_of
 from r2p.codecs import UnknownType, management
 from r2p.codecs.keys import ANY_SESSION, Challenge, Proof, Seal
 from r2p.codecs.management import ManagementType
 from r2p.errors import DecodeError
 from r2p.keys import SharedKey
-from r2p.protocols.keys import PROOF_VALID, SESSIONS_MAX, KeyProtocol, LinkEnd, Verdict
+from r2p.names import CALLS, MANAGEMENT
+from r2p.protocols.keys import (
+    PROOF_VALID,
+    SEALS_MAX,
+    SESSIONS_MAX,
+    KeyProtocol,
+    LinkEnd,
+    Message,
+    Verdict,
+)
 from r2p.runtime.topic import TopicSpace
 from r2p.transports.stats import LinkStats
 from r2p.units import LONG_AGO, MILLISECOND, SECOND
 
+_CALLS, _MANAGEMENT = CALLS.encode(), MANAGEMENT.encode()
 _KEY_TYPES = (ManagementType.CHALLENGE, ManagementType.PROOF, ManagementType.SEAL)
 _CHALLENGE_EVERY = 250 * MILLISECOND  # ns; a serial line may lose one
 _SILENCE = 800 * MILLISECOND  # ns without an answer after which the reason is reported: a tool's user waits
 _SERVER_SILENCE = 5 * SECOND  # ... and after which a server gives the place of the client to others
+_SEAL_LATE = SECOND // 2  # ns in which a seal of a request, or of its repetition, arrives
+_REPEATED_WITHIN = 3  # ... and besides, in times that a request takes on a slow link
 _UNSURE = SECOND // 2  # ns in which what arrives on a serial line may have been meant for the program before this one
 
 OTHER_END_WANTS_KEY = "the other end wants a key, and this URL has none: add ?key=FILE to it"
@@ -45,6 +62,9 @@ class GuardedLink(Protocol):
     def handle_management(self, data: bytes, source: Hashable) -> None:
         """Handle a management message that counts."""
 
+    def sealer(self, source: Hashable) -> Hashable:
+        """Return what seals and what they seal have in common."""
+
 
 class GuardedHub(Protocol):
     """The module as the guard of a link sees it."""
@@ -55,20 +75,47 @@ class GuardedHub(Protocol):
     def message_refused(self, link: Any, message: management.Management, verdict: Verdict) -> None:
         """Report that a message of a link does not count, as it lacks the link's key."""
 
+    def concerns_call(self, link: Any, data: bytes) -> bool:
+        """Return whether a request that changes something is to be handled or passed on here."""
+
+    def call_received(self, link: Any, data: bytes, source: Hashable) -> None:
+        """Handle a message of r2p's own services from this address."""
+
+    def call_refused(self, link: Any, data: bytes, source: Hashable, verdict: Verdict) -> None:
+        """Refuse a request that does not count, as it lacks the link's key."""
+
+
+class _Doubtful(msgspec.Struct):
+    """A request that has not counted; `due` (monotonic ns) is when it is refused, unless its sender proves itself."""
+
+    due: int
+    data: bytes
+    source: Hashable
+    verdict: Verdict
+
 
 class LinkGuard:
     """The guard of one link."""
 
-    def __init__(self, protocol: KeyProtocol, clock: Clock, hub: GuardedHub, link: GuardedLink) -> None:
+    def __init__(self, protocol: KeyProtocol, space: TopicSpace, hub: GuardedHub, link: GuardedLink) -> None:
         self.protocol = protocol
-        self._clock = clock
+        self._clock = space.clock
         self._hub = hub
         self._link = link
         self._admitted: dict[Hashable, int] = {}  # when a message of each sender counted last, of SESSIONS_MAX
+        self._sealed: dict[Hashable, int] = {}  # ... and when each sent a seal that may be of the key
+        self._doubtful: deque[_Doubtful] = deque(maxlen=SEALS_MAX)
+        self._alarm = Alarm(space.loop, self._settle, background=True)
 
     def link_up(self) -> None:
         """Begin anew: the link is up."""
         self.protocol.restart()
+        self._doubtful.clear()
+
+    def close(self) -> None:
+        """Stop, as the link is closed."""
+        self._doubtful.clear()
+        self._alarm.close()
 
     def send(self, data: bytes, *, urgent: bool) -> None:
         """Send a management message, behind its seal if it needs one."""
@@ -76,6 +123,10 @@ class LinkGuard:
             seal = self.protocol.seal_order(self._clock.monotonic(), data)
             self._link.write_management(management.encode(seal), urgent=urgent)
         self._link.write_management(data, urgent=urgent)
+
+    def seal_call(self, data: bytes) -> None:
+        """Send the seal of a request that changes something; the request is to follow."""
+        self._link.write_management(management.encode(self.protocol.seal(_CALLS, data)))
 
     def challenge(self) -> None:
         """Challenge the other end of the line to prove that it has the key."""
@@ -95,38 +146,80 @@ class LinkGuard:
         if isinstance(message, management.Order) and not self._hub.concerns_order(message.module):
             return True  # discovery ignores it
         now = self._clock.monotonic()
-        return self._counts(now, data, self.protocol.admit(now, data, source), source)
+        return self._counts(now, (_MANAGEMENT, data), self.protocol.admit(now, (_MANAGEMENT, data), source), source)
 
-    def _counts(self, now: int, data: bytes, verdict: Verdict, source: Hashable) -> bool:
+    def admits_call(self, data: bytes, source: Hashable, duration: float) -> bool:
+        """Return whether the link is to handle a request that changes something, from this address.
+
+        `duration`: seconds that the link takes for a longest one.
+        """
+        if not self._hub.concerns_call(self._link, data):
+            return True  # nothing becomes of it
+        now, sealer = self._clock.monotonic(), self._link.sealer(source)
+        verdict = self.protocol.admit(now, (_CALLS, data), sealer)
+        if verdict in (Verdict.NO_KEY, Verdict.OTHER_KEY):
+            late = _SEAL_LATE + round(_REPEATED_WITHIN * duration * SECOND)
+            self._doubt(_Doubtful(now + late, data, source, verdict))
+        elif verdict is Verdict.UNPROVEN:
+            self._doubt(_Doubtful(now + PROOF_VALID, data, source, verdict))
+        return self._counts(now, (_CALLS, data), verdict, sealer)
+
+    def _counts(self, now: int, message: Message, verdict: Verdict, source: Hashable) -> bool:
         """Return whether a message counts, after this verdict; otherwise count it as lost, and report it."""
         self._write(*self.protocol.pop_messages())
+        topic, data = message
         if verdict is Verdict.ADMITTED:
-            self._note_admitted(now, source)
+            _note(self._admitted, source, now)
+            if self._doubtful:  # it was repeated, and proven meanwhile
+                self._doubtful = deque((each for each in self._doubtful if each.data != data), SEALS_MAX)
         elif verdict is not Verdict.UNPROVEN:
             self._link.stats.lost[verdict.value] += 1
-            if now - self._admitted.get(source, LONG_AGO) >= PROOF_VALID:  # else only a seal was lost, or is late
+            lost_seal = now - self._admitted.get(source, LONG_AGO) < PROOF_VALID  # or it is late
+            if topic == _MANAGEMENT and not lost_seal:
                 self._hub.message_refused(self._link, management.decode(data), verdict)
         return verdict is Verdict.ADMITTED
 
-    def _note_admitted(self, now: int, source: Hashable) -> None:
-        self._admitted.pop(source, None)
-        self._admitted[source] = now
-        if len(self._admitted) > SESSIONS_MAX:
-            del self._admitted[next(iter(self._admitted))]
+    def _doubt(self, doubtful: _Doubtful) -> None:
+        """Decide about a request later, when its sender has had the time to prove itself."""
+        self._doubtful.append(doubtful)
+        self._alarm.set(min(each.due for each in self._doubtful))
+
+    def _settle(self) -> None:
+        """Refuse requests whose senders have not proven themselves."""
+        now = self._clock.monotonic()
+        due = [each for each in self._doubtful if each.due <= now]
+        self._doubtful = deque((each for each in self._doubtful if each.due > now), SEALS_MAX)
+        self._alarm.set(min((each.due for each in self._doubtful), default=None))
+        for each in due:
+            if each.verdict is Verdict.UNPROVEN:
+                self._link.stats.lost["unproven"] += 1
+            elif now - self._sealed.get(self._link.sealer(each.source), LONG_AGO) >= PROOF_VALID:
+                self._hub.call_refused(self._link, each.data, each.source, each.verdict)
 
     def _handle(self, message: Challenge | Proof | Seal, source: Hashable) -> None:
         now = self._clock.monotonic()
         match message:
             case Seal():
+                if self.protocol.has_key(message):
+                    _note(self._sealed, source, now)
                 overtaken = self.protocol.note_seal(now, message, source)
                 if overtaken is not None:
-                    self._link.stats.lost[Verdict.NO_KEY.value] -= 1  # as which it was counted
-                    if self._counts(now, *overtaken, source):
-                        self._link.handle_management(overtaken[0], source)
+                    self._handle_overtaken(now, *overtaken, source)
             case Proof():
                 self.protocol.note_proof(now, message)
             case Challenge():
                 self._answer(now, message)
+
+    def _handle_overtaken(self, now: int, message: Message, verdict: Verdict, source: Hashable) -> None:
+        """Handle a message whose seal has come after it, if it counts."""
+        self._link.stats.lost[Verdict.NO_KEY.value] -= 1  # as which it was counted
+        if not self._counts(now, message, verdict, source):
+            return
+        topic, data = message
+        if topic == _CALLS:
+            self._hub.call_received(self._link, data, source)
+        else:
+            self._link.handle_management(data, source)
 
     def _answer(self, now: int, challenge: Challenge) -> None:
         proof = self.protocol.answer(now, challenge)
@@ -215,6 +308,14 @@ class LineGate:
         if not self._reported and (self._at_once or now - self._began >= _UNSURE):
             self._reported = True
             self._refused(reason, text)
+
+
+def _note(times: dict[Hashable, int], source: Hashable, now: int) -> None:
+    """Note when something came last from a sender, of SESSIONS_MAX."""
+    times.pop(source, None)
+    times[source] = now
+    if len(times) > SESSIONS_MAX:
+        del times[next(iter(times))]
 
 
 def key_protocol(space: TopicSpace, key: SharedKey, end: LinkEnd) -> KeyProtocol:

@@ -102,6 +102,12 @@ class Hub(Protocol):
     def call_received(self, link: "Link", data: bytes, source: Hashable) -> None:
         """Handle a message of r2p's own services from this address."""
 
+    def concerns_call(self, link: "Link", data: bytes) -> bool:
+        """Return whether a request that changes something is for this module, or to be passed on."""
+
+    def call_refused(self, link: "Link", data: bytes, source: Hashable, verdict: Verdict) -> None:
+        """Refuse a request that does not count, as it lacks the link's key."""
+
 
 class GatewayHooks(Protocol):
     """Decisions about one link: by its gateway, or by a module with several links to networks that gateways join."""
@@ -206,7 +212,7 @@ class Link(abc.ABC):
     def use_key(self, key: SharedKey | None, end: LinkEnd = LinkEnd.SHARED) -> None:
         """Guard the link with the key of its URL, if there is one; before the link comes up."""
         if key is not None:
-            self.guard = LinkGuard(key_protocol(self._space, key, end), self._clock, self._hub, self)
+            self.guard = LinkGuard(key_protocol(self._space, key, end), self._space, self._hub, self)
 
     def on_up(self) -> None:
         """Begin to send, and announce everything, as the other end can be reached."""
@@ -266,6 +272,8 @@ class Link(abc.ABC):
         self.up = False
         self._alarm.close()
         self.calls.clear()
+        if self.guard is not None:
+            self.guard.close()
         self._release_topics()
 
     def possible_senders(self) -> set[str]:

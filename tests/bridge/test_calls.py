@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 from collections import Counter
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any, Self
 
 import pytest
@@ -17,15 +17,18 @@ from r2p.codecs.services import Kind, ServiceHeader
 from r2p.errors import ServiceError
 from r2p.sim import SimCan, run
 from r2p.testing.network import node_in
-from r2p.transports.memory import MemoryNetwork
+from r2p.transports.memory import MemoryNetwork, MemoryTransport
 from tests.bridge.test_topologies import CALM, populate, trouble
 from tests.bridge.world import World
-from tests.modules.test_changes import TEST, Desk, knows
+from tests.modules.test_changes import KEY, OTHER, TEST, Desk, KeyedCable, knows
 from tests.modules.test_own_services import WIDE, Stranger, Wide, knows_wide, services
 from tests.transports.cables import LineCable
 from tests.transports.rtcan.networks import until
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from r2p.keys import SharedKey
     from tests.transports.cables import Cable
 
 pytestmark = pytest.mark.virtual_time
@@ -204,6 +207,82 @@ async def test_the_module_of_a_gateway_may_be_changed_where_its_links_let_others
             else:
                 await services(b).change(gw.instance, TEST, b"0")
             assert len(desk.made) == (not text)
+
+
+# Changes, where links have keys
+
+
+@asynccontextmanager
+async def robot_with_keys(
+    *keys: SharedKey | None, **options: Any
+) -> AsyncIterator[tuple[Desk, r2p.Module, r2p.Module]]:
+    """B - GW1 - GW2 - A, on networks with these keys; A, GW1 and B."""
+    networks = [MemoryTransport("lab", MemoryNetwork(delay=0.001), key=key) for key in keys]
+    async with AsyncExitStack() as stack:
+        for number in (0, 1):
+            via, bridge = networks[number : number + 2], r2p.BridgeOptions(**options if not number else {})
+            gateway = r2p.Module(f"GW{number + 1}", via=via, bridge=bridge, watchdog=False)
+            await stack.enter_async_context(gateway)
+            if not number:
+                first = gateway
+        a, b = r2p.Module("A", via=networks[2]), r2p.Module("B", via=networks[0])
+        for each in (a, b):
+            await stack.enter_async_context(each)
+        await until(lambda: knows(b, a))
+        yield Desk(a), first, b
+
+
+async def change(desk: Desk, b: r2p.Module) -> bytes:
+    return await services(b).change(desk.instance, TEST, b"0")
+
+
+@pytest.mark.parametrize("keys", [(KEY, OTHER, KEY), (KEY, KEY, None), (KEY, None, None)])
+async def test_each_gateway_seals_a_change_with_the_key_of_the_next_link(keys: tuple[SharedKey | None, ...]) -> None:
+    async with robot_with_keys(*keys) as (desk, first, b):
+        for _ in range(2):
+            await change(desk, b)
+            await asyncio.sleep(11)
+        assert desk.made == {b"0": 2}
+        assert not any(link.losses["without key"] or link.losses["unproven"] for link in first.links)
+
+
+async def test_a_gateway_lends_its_key_to_no_change() -> None:
+    async with robot_with_keys(None, KEY, KEY, allow_control=True) as (desk, first, b):
+        why = "gateway GW1 passes no changes from memory, without a key, to memory: give memory a key, too"
+        with pytest.raises(ServiceError, match=why):
+            await change(desk, b)
+        assert first.links[0].losses["change refused"] == 1
+
+
+async def test_a_gateway_with_a_key_refuses_a_change_without_it_and_one_that_is_not_on_the_way_does_not_care() -> None:
+    async with robot_with_keys(KEY, KEY, KEY, allow_control=True) as (desk, first, _):
+        lab = first._via[0]
+        async with (
+            r2p.Module("GW3", via=[lab, "memory:elsewhere"], bridge=True, watchdog=False) as other,
+            r2p.Module("C", via=MemoryTransport("lab", lab._network)) as c,  # type: ignore[union-attr]
+        ):
+            await until(lambda: any(view.instance == desk.instance for view in c.network.modules()))
+            with pytest.raises(ServiceError, match=r"gateway GW1 refuses changes from memory: the link has a key: add"):
+                await change(desk, c)
+            assert first.links[0].losses["without key"]
+            assert not other.links[0].losses["without key"]
+            assert not desk.made
+
+
+async def test_a_key_does_not_help_where_nothing_may_go() -> None:
+    async with robot_with_keys(KEY, KEY, KEY, allow_control=True, read_only=("memory:lab#2",)) as (desk, _, b):
+        with pytest.raises(
+            ServiceError, match="gateway GW1 lets no changes onto memory: it is started with --read-only"
+        ):
+            await change(desk, b)
+
+
+async def test_a_line_with_a_key_needs_no_allow_control() -> None:
+    line = KeyedCable()
+    line._a.name = line._b.name = "tcp:robot"
+    async with Chain(line, r2p.BridgeOptions(), r2p.BridgeOptions()) as chain:
+        assert await chain.change(b"100")
+        assert chain.desk.made == {b"100": 1}
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -27,6 +27,7 @@ from r2p.units import SECOND
 
 KEY = SharedKey(bytes(32))
 STOP = management.encode(management.Stop("BOT"))
+ORDER = b"R2P", STOP
 ADMITTED, REPEATED, UNPROVEN = Verdict.ADMITTED, Verdict.REPEATED, Verdict.UNPROVEN
 
 
@@ -36,7 +37,7 @@ def part(end: LinkEnd = LinkEnd.SHARED, key: SharedKey = KEY, numbers: "count[in
 
 def hears(receiver: KeyProtocol, now: int, seal: Seal, data: bytes = STOP) -> Verdict:
     assert receiver.note_seal(now, seal, None) is None
-    return receiver.admit(now, data, None)
+    return receiver.admit(now, (b"R2P", data), None)
 
 
 def introduce(sender: KeyProtocol, receiver: KeyProtocol, now: int) -> bool:
@@ -69,8 +70,8 @@ def test_nothing_counts_twice_nor_from_before_a_proof() -> None:
     assert hears(receiver, 0, seals[-1]) is ADMITTED
     assert hears(receiver, 0, seals[-2]) is ADMITTED  # it was overtaken
     assert receiver.note_seal(0, seals[-1], None) is None
-    assert receiver.admit(0, STOP, None) is Verdict.NO_KEY  # a seal that was used is none
-    assert receiver.admit(0, STOP, None) is Verdict.NO_KEY
+    assert receiver.admit(0, ORDER, None) is Verdict.NO_KEY  # a seal that was used is none
+    assert receiver.admit(0, ORDER, None) is Verdict.NO_KEY
     assert hears(receiver, 0, seals[0]) is not ADMITTED  # out of the window
 
 
@@ -78,19 +79,19 @@ def test_a_seal_of_a_holder_that_counts_wrongly_is_refused() -> None:
     sender, receiver = part(), part()
     introduce(sender, receiver, 0)
     for counter, first in ((5, 6), (5, 0xFFFFFFFF), (0, 0)):
-        wrong = keys.seal(KEY, sender.session, counter, first, (b"R2P", STOP))
+        wrong = keys.seal(KEY, sender.session, counter, first, ORDER)
         assert hears(receiver, 0, wrong) is REPEATED
-    assert hears(receiver, 0, keys.seal(KEY, sender.session, 0xFFFFFFFF, 1, (b"R2P", STOP))) is ADMITTED
+    assert hears(receiver, 0, keys.seal(KEY, sender.session, 0xFFFFFFFF, 1, ORDER)) is ADMITTED
 
 
 def test_a_message_may_overtake_its_seal() -> None:
     sender, receiver = part(), part()
     introduce(sender, receiver, 0)
     seal = sender.seal_order(0, STOP)
-    assert receiver.admit(0, STOP, "a") is Verdict.NO_KEY
-    assert receiver.note_seal(0, seal, "a") == (STOP, ADMITTED)
+    assert receiver.admit(0, ORDER, "a") is Verdict.NO_KEY
+    assert receiver.note_seal(0, seal, "a") == (ORDER, ADMITTED)
     late = sender.seal_order(0, STOP)
-    assert receiver.admit(0, STOP, "a") is Verdict.NO_KEY
+    assert receiver.admit(0, ORDER, "a") is Verdict.NO_KEY
     assert receiver.note_seal(SEAL_VALID + 1, late, "a") is None
 
 
@@ -113,10 +114,10 @@ def test_a_proof_is_renewed_before_it_ends_and_then_what_was_held_back_does_not_
 
 def test_another_key_is_told_from_none() -> None:
     receiver, other = part(), part(key=SharedKey(bytes(range(32))))
-    assert receiver.admit(0, STOP, 1) is Verdict.NO_KEY
+    assert receiver.admit(0, ORDER, 1) is Verdict.NO_KEY
     receiver.note_seal(0, other.seal_order(0, STOP), 1)
-    assert receiver.admit(0, STOP, 1) is Verdict.OTHER_KEY
-    assert receiver.admit(0, STOP, 2) is Verdict.NO_KEY
+    assert receiver.admit(0, ORDER, 1) is Verdict.OTHER_KEY
+    assert receiver.admit(0, ORDER, 2) is Verdict.NO_KEY
 
 
 @pytest.mark.parametrize("prover", LinkEnd)
@@ -144,9 +145,9 @@ def test_floods_cost_no_more_than_so_much() -> None:
     assert sum(each is not None for each in answers) == ANSWERS_MAX
     assert sender.answer(SECOND, Challenge(sender.session, bytes(16))) is not None
     for number in range(1000):
-        receiver.note_seal(0, keys.seal(KEY, number + 1, 1, 1, (b"R2P", STOP)), number)
-        receiver.admit(0, STOP, number)
-        receiver.admit(0, bytes(32), number)
+        receiver.note_seal(0, keys.seal(KEY, number + 1, 1, 1, ORDER), number)
+        receiver.admit(0, ORDER, number)
+        receiver.admit(0, (b"R2P", bytes(32)), number)
     assert len(receiver._challenged) <= CHALLENGES_MAX
     assert max(len(receiver._seals), len(receiver._held)) <= SEALS_MAX
 
@@ -213,7 +214,7 @@ class Stranger:
         match message:
             case Seal():
                 held = self.receiver.note_seal(self.now, message, None)
-                for verdict in (held and held[1], self.receiver.admit(self.now, STOP, None)):
+                for verdict in (held and held[1], self.receiver.admit(self.now, ORDER, None)):
                     if verdict is ADMITTED:
                         self.fresh.remove((message.session, message.first))
                         self.obeyed += 1

@@ -148,6 +148,7 @@ class LineEnd(Transport, Carrier):
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         self.link = link = LineLink(self.name, hub)
+        self.prepare(link)
         hub.attach(link)
         try:
             if self._wanted:
@@ -158,6 +159,9 @@ class LineEnd(Transport, Carrier):
             link.close()
             hub.detach(link)
             self.link = None
+
+    def prepare(self, link: LineLink) -> None:
+        """Equip the link before the module gets it."""
 
     def plug(self) -> None:
         self._wanted = True

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from r2p.runtime.events import ModuleEvent
-    from r2p.transports.link import Hub
+    from r2p.transports.line import LineLink
 
 SOON = 0.05
 """Seconds in which a keyed order is obeyed, its challenge included."""
@@ -293,15 +293,8 @@ class KeyedEnd(LineEnd):
         self._key = key
         self._end = end
 
-    async def run(self, hub: Hub, opened: object) -> None:
-        attach = hub.attach
-
-        def with_key(link: object) -> None:
-            link.use_key(self._key, self._end)  # type: ignore[attr-defined]
-            attach(link)  # type: ignore[arg-type]
-
-        hub.attach = with_key  # type: ignore[method-assign]
-        await super().run(hub, opened)  # type: ignore[arg-type]
+    def prepare(self, link: LineLink) -> None:
+        link.use_key(self._key, self._end)
 
 
 def line(*given: SharedKey | None) -> tuple[KeyedEnd, KeyedEnd]:
