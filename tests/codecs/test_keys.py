@@ -19,15 +19,16 @@ KEY = SharedKey(bytes(32))
 @pytest.mark.parametrize("vector", VECTORS, ids=lambda vector: vector["name"])
 def test_messages_are_those_that_openssl_computed(vector: dict[str, Any]) -> None:
     key = SharedKey(bytes.fromhex(vector["key"]))
-    challenge, proof, seal = vector["challenge"], vector["proof"], vector["seal"]
+    challenge, proof, seal, call = (vector[name] for name in ("challenge", "proof", "seal", "seal_of_call"))
     session, nonce = challenge["session"], bytes.fromhex(challenge["nonce"])
     covered = (b"R2P", bytes.fromhex(seal["covers"]))
     made: list[management.Management] = [
         keys.Challenge(session, nonce),
         keys.prove(key, nonce, session, proof["counter"], proof["end"]),
         keys.seal(key, session, seal["counter"], seal["first"], covered),
+        keys.seal(key, session, call["counter"], call["first"], (b"R2P_CALL", bytes.fromhex(call["covers"]))),
     ]
-    for message, expected in zip(made, (challenge, proof, seal), strict=True):
+    for message, expected in zip(made, (challenge, proof, seal, call), strict=True):
         data = bytes.fromhex(expected["message"])
         assert management.encode(message) == data
         assert management.decode(data) == message
