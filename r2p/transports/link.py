@@ -16,7 +16,6 @@ from typing import ClassVar, Protocol
 import msgspec
 
 from r2p.clock import Alarm
-from r2p.codecs import management
 from r2p.codecs.management import NO_PARAMS, QUEUE
 from r2p.keys import SharedKey
 from r2p.messages import ClockOffset, Message
@@ -37,13 +36,13 @@ from r2p.protocols.discovery.events import (
     possible_senders,
 )
 from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
-from r2p.protocols.keys import LinkEnd, Verdict
+from r2p.protocols.keys import LinkEnd
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample, Source
-from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
+from r2p.runtime.topic import RemoteSubscriber, Topic
 from r2p.transports.announcement import NOTHING, Announcement, announcement_of, refused_publishers
-from r2p.transports.call_channel import CallChannel
-from r2p.transports.guard import LinkGuard, key_protocol
+from r2p.transports.call_channel import CallChannel, CallHub
+from r2p.transports.guard import GuardedHub, LinkGuard, key_protocol
 from r2p.transports.stats import RETRY_AFTER_ERROR, LinkStats, LoggedCounter
 from r2p.units import SECOND
 
@@ -51,11 +50,8 @@ MESSAGES_PER_TURN = 64
 """Messages that a link delivers before it lets the event loop run once."""
 
 
-class Hub(Protocol):
+class Hub(GuardedHub, CallHub, Protocol):
     """The module as a transport sees it."""
-
-    @property
-    def space(self) -> TopicSpace: ...
 
     @property
     def instance(self) -> int:
@@ -92,21 +88,6 @@ class Hub(Protocol):
 
     def discovered(self, link: "Link", event: Event) -> None:
         """Handle what the discovery of a link has found."""
-
-    def concerns_order(self, module: str) -> bool:
-        """Return whether an order for a module (by its alias) is for this one, or to be passed on."""
-
-    def message_refused(self, link: "Link", message: management.Management, verdict: Verdict) -> None:
-        """Report that a message does not count, as it lacks the link's key."""
-
-    def call_received(self, link: "Link", data: bytes, source: Hashable) -> None:
-        """Handle a message of r2p's own services from this address."""
-
-    def concerns_call(self, link: "Link", data: bytes) -> bool:
-        """Return whether a request that changes something is for this module, or to be passed on."""
-
-    def call_refused(self, link: "Link", data: bytes, source: Hashable, verdict: Verdict) -> None:
-        """Refuse a request that does not count, as it lacks the link's key."""
 
 
 class GatewayHooks(Protocol):
