@@ -119,6 +119,7 @@ SEALED_TYPES = (*ORDER_TYPES, *GATEWAY_TYPES)
 FLAG_STOPPED = 1
 FLAG_REBOOTED = 2
 FLAG_BOOT = 4
+FLAG_LOADER = 8  # an r2p module that has a boot loader, as firmware does
 
 # Hello.flags
 HELLO_QUERY = 1  # asks all modules to repeat what they have: this one is new

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from r2p.clock import check_seconds
-from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES, WIRE_VERSION
+from r2p.codecs.management import FLAG_BOOT, FLAG_LOADER, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES, WIRE_VERSION
 from r2p.codecs.own_services import WIRE_MIN, Operation
 from r2p.errors import DecodeError, Error, ParameterError
 from r2p.messages import Layout, Message
@@ -66,7 +66,8 @@ class ModuleView(msgspec.Struct):
     """A module. `state` is "running", "stopped", "boot" or "observer"; `age` is in s since its last message.
 
     `link` is empty for this module, `instance` is None for firmware. `wire` is the version of the wire formats that the
-    module uses, `release` its version of r2p: None where it does not announce them, as firmware.
+    module uses, `release` its version of r2p: None where it does not announce them, as firmware. `has_loader`: whether
+    it has a boot loader, as firmware and emulated boards do.
     """
 
     name: str
@@ -77,6 +78,7 @@ class ModuleView(msgspec.Struct):
     instance: int | None
     wire: int | None = None
     release: str | None = None
+    has_loader: bool = False
 
 
 class NetworkView:
@@ -93,6 +95,7 @@ class NetworkView:
         state = _state(module.flags, observer=module.observer)
         rebooted = bool(module.flags & FLAG_REBOOTED)
         own = ModuleView(module.space.module, state, rebooted, 0.0, "", module.instance, WIRE_VERSION, __version__)
+        own.has_loader = bool(module.flags & FLAG_LOADER)
         others = [_module_view(link, info, now) for link in module.links for info in link.discovery.modules.values()]
         return [own, *sorted(others, key=lambda view: (view.name, view.link))]
 
@@ -237,7 +240,8 @@ def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:
     state = _state(info.flags, observer=info.observer)
     age = (now - info.last_heard) / SECOND
     rebooted, wire, release = bool(info.flags & FLAG_REBOOTED), info.wire or None, info.release or None
-    return ModuleView(info.name, state, rebooted, age, link.name, info.instance, wire, release)
+    has_loader = info.instance is None or bool(info.flags & FLAG_LOADER)
+    return ModuleView(info.name, state, rebooted, age, link.name, info.instance, wire, release, has_loader)
 
 
 def _state(flags: int, *, observer: bool) -> str:

@@ -13,7 +13,7 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from types import TracebackType
 from typing import Self
 
@@ -113,6 +113,8 @@ class Module:
         """True after STOP has ended the nodes; REBOOT starts them again."""
         self.refused: dict[str, int] = {}
         """Numbers of refused commands from the network, by name."""
+        self.boot_loader: Callable[[], Awaitable[None]] | None = None
+        """What carries out BOOTLOAD. Only emulated boards have it; programs on a PC refuse BOOTLOAD."""
         self.network = NetworkView(lambda: self._opened)
         """The network as this module knows it."""
         file = None if params_file is None else ParameterFile(params_file)
@@ -520,7 +522,7 @@ class LogTopic:
 
 
 class CommandHandler:
-    """Carries out STOP and REBOOT from the network. A program on a PC refuses BOOTLOAD."""
+    """Carries out STOP and REBOOT from the network, and BOOTLOAD where there is a boot loader."""
 
     def __init__(self, module: Module) -> None:
         self.tasks: asyncio.TaskGroup | None = None
@@ -536,7 +538,7 @@ class CommandHandler:
         self._log(logging.WARNING, f"module {name}: {command.name} from the network")
         if self.tasks is None:
             return
-        if command is Command.BOOTLOAD:
+        if command is Command.BOOTLOAD and self._module.boot_loader is None:
             refused = self._module.refused
             count = refused[command.name] = refused.get(command.name, 0) + 1
             text = f"module {name} is a program on a PC, it has no boot loader: BOOTLOAD refused"
@@ -549,7 +551,11 @@ class CommandHandler:
     async def _run(self) -> None:
         while self._latest is not None and self.tasks is not None:
             command, self._latest = self._latest, None
-            await (self._module.stop() if command is Command.STOP else self._module.reboot())
+            module = self._module
+            if command is Command.BOOTLOAD and module.boot_loader is not None:
+                await module.boot_loader()
+            else:
+                await (module.stop() if command is Command.STOP else module.reboot())
 
     def _log(self, level: int, text: str, detail: str = "") -> None:
         """Log an event that other modules can cause any number of times a second."""

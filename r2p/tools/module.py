@@ -199,7 +199,7 @@ class _CommandSender:
     def _check_has_loader(self) -> None:
         """Raise r2p.Error if the command needs a boot loader, and the module has none."""
         view = _find(self._session, self._name)
-        if self._command is r2p.Command.BOOTLOAD and view is not None and view.instance is not None:
+        if self._command is r2p.Command.BOOTLOAD and view is not None and not view.has_loader:
             raise r2p.Error(f"{self._name} is an r2p module, a program without a boot loader: it would refuse BOOTLOAD")
 
     def _is_over(self) -> bool:

@@ -10,6 +10,7 @@ What firmware has in its configuration are parameters of the nodes: they set the
 import asyncio
 import functools
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from types import TracebackType
 from typing import Any, Protocol, Self
 
 import msgspec
@@ -17,8 +18,10 @@ import msgspec
 import r2p
 from r2p.bridge import BridgeOptions
 from r2p.clock import Ticker
+from r2p.codecs.management import FLAG_BOOT, FLAG_LOADER, FLAG_REBOOTED
 from r2p.modules.supervisor import NodeFunction
 from r2p.msg import Battery, Encoder, Float32, Led, PowerEvent, Setpoint
+from r2p.sim.modules.boot import BoardBoot
 from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Threshold
 from r2p.sim.physics.world import ADC_MAX, ADC_REFERENCE, adc_counts
 from r2p.transports.link import Transport
@@ -72,7 +75,11 @@ class Plant:
 
 
 class Board(r2p.Module):
-    """A hardware module with its node functions by name; more can be started once it is open, as on any module."""
+    """A hardware module with its node functions by name; more can be started once it is open, as on any module.
+
+    BOOTLOAD ends its nodes and starts the loader of `boot`, until REBOOT. STOP in boot mode makes it deaf to commands,
+    and so does an app that can't run, whose start also ends the nodes; `boot.fault` says why.
+    """
 
     def __init__(
         self,
@@ -84,14 +91,61 @@ class Board(r2p.Module):
         bridge: bool | BridgeOptions = False,
     ) -> None:
         super().__init__(name, via=via, remap=remap, watchdog=False, bridge=bridge)
+        self.boot = BoardBoot()
+        """The loader and the apps. Another run of the same hardware gets those of the previous one."""
+        self.boot_loader = self.bootload
         self._programs = dict(nodes or {})
 
     async def __aenter__(self) -> Self:
-        """Open the module and start its nodes. Raises as `r2p.Module` does."""
+        """Open the module and start its nodes and apps. Raises as `r2p.Module` does."""
         await super().__aenter__()
+        self.boot.fault = ""
+        self._opened.set_flags(FLAG_LOADER)
         for name, function in self._programs.items():
             self.start(function, name=name)
+        await self._start_apps()
         return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the module. Raises as `r2p.Module` does."""
+        try:
+            await self.boot.end()
+            self.boot.loader.cut_power(self.space.clock.monotonic())
+        finally:
+            await super().__aexit__(kind, error, trace)
+
+    async def stop(self) -> None:
+        """End nodes and apps, as `r2p.Module` does. In boot mode, the board then obeys no command any more."""
+        if self.boot.in_boot_mode:
+            self.boot.halt(f"module {self.name}: STOP in boot mode, where its management hangs")
+        if not self.boot.fault:
+            await self.boot.end()
+            await super().stop()
+
+    async def reboot(self) -> None:
+        """End nodes and apps, or the loader, and start nodes and apps anew. Raises Closed if it is not open."""
+        if not self.boot.fault:
+            await self.boot.end()
+            await super().reboot()
+            self._opened.set_flags(FLAG_REBOOTED | FLAG_LOADER)
+            await self._start_apps()
+
+    async def bootload(self) -> None:
+        """End nodes and apps, and start the loader, anew if it runs. Only `reboot` leaves it."""
+        if not self.boot.fault:
+            await self.boot.end()
+            await super().stop()
+            self.rebooted = True
+            self._opened.set_flags(FLAG_REBOOTED | FLAG_BOOT | FLAG_LOADER)
+            self.boot.start_loader(self.space)
+
+    async def _start_apps(self) -> None:
+        self.boot.start_apps(self.space)
+        if self.boot.fault:
+            await self.boot.end()
+            await super().stop()
 
 
 class Closes(Protocol):

@@ -26,7 +26,7 @@ from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import DecodeError, Error
 from r2p.messages import Layout, Message, layout
 from r2p.names import LOADER_PREFIX, MANAGEMENT, MODULE_FIELD, TOPIC_FIELD, module_name, topic_name
-from r2p.sim.modules.installed import EndlessList, FlashApp
+from r2p.sim.modules.launch import Halted, starting
 from r2p.sim.modules.loader import QUEUE, EmulatedLoader
 from r2p.units import MILLISECOND, SECOND
 
@@ -254,24 +254,12 @@ class FirmwareModule:
             self._send(now, subscriber.request)
 
     def _start_apps(self) -> None:
-        """Start the enabled apps, in the order in which they are in flash."""
-        started: list[FlashApp] = []
         try:
-            for app in self.loader.apps:
-                if app.enabled and not self.fault:
-                    self._start_app(app, started)
-                    started.append(app)
-        except EndlessList as error:
-            self.fault = f"{error}: it hangs"
-
-    def _start_app(self, app: FlashApp, started: list[FlashApp]) -> None:
-        self.log.append(f"LAUNCH {app.name}")
-        least = self.loader.memory.least_stack
-        if app.setup.stacklen < least:
-            self.fault = f"app {app.name}: a stack of {app.setup.stacklen} bytes is too small, it takes {least}"
-        self.log.extend(f"{app.name} shares RAM with {each.name}" for each in started if app.shares_ram_with(each))
-        if app.name in self.programs:
-            self._add_nodes(self.programs[app.name](self.loader.apps.config(app)))
+            for app in starting(self.loader.apps, self.log):
+                if app.name in self.programs:
+                    self._add_nodes(self.programs[app.name](self.loader.apps.config(app)))
+        except Halted as error:
+            self.fault = str(error)
 
     def _on_stop(self, now: int) -> None:
         """Stop the nodes; of the round of repetition, what belongs to the current node is still sent."""

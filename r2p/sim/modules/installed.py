@@ -76,8 +76,8 @@ class InstalledApps:
     """The list of apps. To iterate over it raises EndlessList, where firmware hangs, if it leads back to itself."""
 
     def __init__(self, flash: Flash) -> None:
+        self.memory = flash.memory
         self._flash = flash
-        self._memory = flash.memory
 
     def __iter__(self) -> Iterator[FlashApp]:
         for address in self._addresses():
@@ -93,12 +93,13 @@ class InstalledApps:
         return self._flash.read(app.outcome.cfgadr, min(app.outcome.cfglen, _CONFIG_MAX))
 
     def last(self) -> FlashApp | None:
-        """Return the app that was loaded last."""
-        return max(self, key=lambda app: app.infoadr, default=None)
+        """Return the app at the end of the list."""
+        apps = list(self)
+        return apps[-1] if apps else None
 
     def free_address(self) -> int:
         """Return the address for another app, 0 if there is no room at all."""
-        address = self._memory.flash_start
+        address = self.memory.flash_start
         for app in self:
             address = app.nextadr
         return address if self._is_inside(address) else 0
@@ -109,21 +110,22 @@ class InstalledApps:
         if not infoadr:
             return None
         pgmadr, datapgmadr, nextadr = self._parts(infoadr, setup.pgmlen, setup.datalen)
-        if nextadr > self._memory.flash_end:
+        if nextadr > self.memory.flash_end:
             return None
         return LinkingAddresses(infoadr, pgmadr, 0, 0, datapgmadr, nextadr)
 
     def _addresses(self) -> Iterator[int]:
-        address = self._memory.flash_start
+        address = self.memory.flash_start
+        visited: set[int] = set()
         while self._is_inside(address):
             signature, pgmlen, _, datalen = struct.unpack("<4I", self._flash.read(address, 16))
             if signature != SIGNATURE:
                 return
+            if address in visited:
+                raise EndlessList(f"the list of apps leads back to the one at {address:08X}")
+            visited.add(address)
             yield address
-            following = self._parts(address, pgmlen, datalen)[2]
-            if following <= address:
-                raise EndlessList(f"the app at {address:08X} says that the next one is at {following:08X}")
-            address = following
+            address = self._parts(address, pgmlen, datalen)[2]
 
     def _app(self, address: int) -> FlashApp:
         _, pgmlen, bsslen, datalen, bssadr, dataadr, cfgadr, cfglen, stacklen, *rest = _ENTRY.unpack(
@@ -147,13 +149,13 @@ class InstalledApps:
 
     def _parts(self, infoadr: int, pgmlen: int, datalen: int) -> tuple[int, int, int]:
         """Return the addresses of an app's code, of its initial variables, and of the next app; they may wrap."""
-        align = self._memory.flash_align
+        align = self.memory.flash_align
         pgmadr = infoadr + aligned(_SIZE, align)
         after = (pgmadr + aligned(pgmlen, align)) % ADDRESSES
         return pgmadr, after if datalen else 0, (after + aligned(datalen, align)) % ADDRESSES
 
     def _is_inside(self, address: int) -> bool:
-        return self._memory.flash_start <= address < self._memory.flash_end
+        return self.memory.flash_start <= address < self.memory.flash_end
 
 
 def entry(setup: LinkingSetup, addresses: LinkingAddresses, outcome: LinkingOutcome) -> bytes:

@@ -149,6 +149,8 @@ class EmulatedLoader:
             self.drops["loader not running"] += 1
         elif self.requests in self.faults.lost_requests:
             self.drops["lost request"] += 1
+        elif self.is_busy(now):
+            self.drops["writing flash"] += 1
         elif len(self._queue) >= QUEUE:
             self.drops["loader queue full"] += 1
         else:

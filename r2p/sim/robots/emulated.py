@@ -39,6 +39,7 @@ from r2p.transports.link import Transport
 
 if TYPE_CHECKING:
     from r2p.modules.supervisor import NodeFunction
+    from r2p.sim.modules.boot import BoardBoot
 
 STEP = 0.002
 """Seconds of the physics, and of the control of the motors."""
@@ -117,6 +118,8 @@ class Triskar2:
         self.hardware = Hardware(seed, world)
         self.modules: dict[str, Board] = {}
         """The modules that are switched on, by name."""
+        self.boots: dict[str, BoardBoot] = {}
+        """Loader and flash memory of each module that was ever switched on, by name."""
         chain: dict[str, Any] = {} if traffic is None else {"traffic": traffic}
         self._boards: dict[str, tuple[Callable[[str], Board], dict[str, NodeFunction]]] = {
             "MOTOR1": (self._motor, {"invkin": functools.partial(triskar2.inverse_kinematics, **chain)}),
@@ -189,6 +192,7 @@ class Triskar2:
         async with contextlib.AsyncExitStack() as opening:
             make, nodes = self._boards[name]
             board = self.modules[name] = make(name)
+            board.boot = self.boots.setdefault(name, board.boot)
             opening.callback(self.modules.pop, name)
             await opening.enter_async_context(board)
             for node, function in nodes.items():
