@@ -153,10 +153,14 @@ async def run(node: r2p.Node, topic: str, session: Session) -> None:
     answers = (loader.decode(sample.data) async for sample in subscriber.samples() if sample.source.link)
     message = next(session)
     first: asyncio.Task[Loader] = asyncio.ensure_future(anext(answers))
-    while not first.done():
-        publisher.publish_nowait(BootMessage(data=tuple(loader.encode(message))))
-        await asyncio.wait([first], timeout=1.0)
-    answer = await first
+    try:
+        while not first.done():
+            publisher.publish_nowait(BootMessage(data=tuple(loader.encode(message))))
+            await asyncio.wait([first], timeout=1.0)
+        answer = first.result()
+    finally:
+        first.cancel()
+        await asyncio.wait([first])
     while True:
         try:
             message = session.send(answer)
