@@ -1,6 +1,7 @@
 """Types that grow: `subscribe(..., accept={OldScan: upgrade})` receives messages of older types, and converts them.
 
-Such a subscription asks for its topic without a type, so that publishers of any type send; what arrives is judged here.
+Such a subscription asks for its topic without a type, so that publishers of each of them send. Discovery refuses those
+that have announced yet another one; of a gateway, which asks for what others want as well, each message is judged here.
 The type of a message is the one that its publisher has announced. Of a publisher that has not, as firmware, only the
 length tells it.
 """
@@ -42,6 +43,11 @@ class AcceptedTypes:
             )
         self._layouts[other.fingerprint] = other
         self._converters[other.fingerprint] = convert
+
+    @property
+    def layouts(self) -> list[Layout[Any]]:
+        """The types, that of the subscription first."""
+        return list(self._layouts.values())
 
     @property
     def size(self) -> int:

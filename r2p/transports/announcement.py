@@ -1,8 +1,11 @@
 """What a link announces of a topic of this module."""
 
+from typing import Any
+
 import msgspec
 
 from r2p.codecs.management import ANY_TYPE, CLASS_LATCHES, NO_PARAMS, QUEUE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.messages import Layout
 from r2p.protocols.discovery.directory import TopicInfo
 from r2p.protocols.discovery.events import TopicType, describe_mismatch
 from r2p.runtime.topic import Topic
@@ -31,19 +34,27 @@ NOTHING = Announcement()
 
 def type_of(topic: Topic) -> TopicType:
     """The size and fingerprint of a topic's messages, as far as this module knows them."""
-    layout = topic.layout
-    return TopicType() if layout is None else TopicType(layout.size, layout.fingerprint, layout.varies)
+    return TopicType() if topic.layout is None else _type_of_layout(topic.layout)
+
+
+def _type_of_layout(layout: Layout[Any]) -> TopicType:
+    return TopicType(layout.size, layout.fingerprint, layout.varies)
 
 
 def refused_publishers(topic: Topic, info: TopicInfo | None) -> str | None:
     """Describe how the type of the publishers at the other end of a link differs from this module's, if it does."""
-    ours, theirs = type_of(topic), info.types.get(ROLE_PUBLISHES) if info is not None and info.mismatch else None
+    ours, theirs = asked_type(topic), info.types.get(ROLE_PUBLISHES) if info is not None and info.mismatch else None
     return None if theirs is None or ours.fits(theirs) else describe_mismatch(ROLE_PUBLISHES, ours, theirs)
 
 
 def asked_type(topic: Topic) -> TopicType:
-    """The type in which this module subscribes to a topic: unknown, so that it fits any, if it accepts several."""
-    return TopicType() if topic.accepted else type_of(topic)
+    """The type in which this module subscribes to a topic; if it accepts several, unknown but for these."""
+    if not topic.accepted:
+        return type_of(topic)
+    layouts = {each.fingerprint: each for accepted in topic.accepted for each in accepted.layouts}
+    if topic.layout is not None:
+        layouts[topic.layout.fingerprint] = topic.layout
+    return TopicType(accepted=tuple(_type_of_layout(layouts[each]) for each in sorted(layouts)))
 
 
 def announcement_of(topic: Topic) -> Announcement:

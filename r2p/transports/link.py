@@ -459,8 +459,11 @@ class Link(abc.ABC):
             events += discovery.withdraw(now, topic)
         asks_anew = (desired.asked, desired.queue) != (known.asked, known.queue)
         if desired.subscribes and (asks_anew or not known.subscribes):
-            asked = desired.asked
-            events += discovery.subscribe(now, topic, asked.size, desired.queue, asked.fingerprint, varies=asked.varies)
+            asked, queue = desired.asked, desired.queue
+            varies, accepted = asked.varies, asked.accepted
+            events += discovery.subscribe(
+                now, topic, asked.size, queue, asked.fingerprint, varies=varies, accepted=accepted
+            )
         elif known.subscribes and not desired.subscribes:
             events += discovery.unsubscribe(now, topic)
         for (node, role), publisher_class in desired.endpoints.items():

@@ -12,6 +12,7 @@ import pytest
 
 import r2p
 import r2p.msg
+from r2p.codecs.management import ROLE_PUBLISHES
 from r2p.messages import Message
 from r2p.modules.graph import ModuleView
 from r2p.msg import PWM2, Led, Speed3, Text
@@ -489,15 +490,27 @@ async def test_a_subscriber_accepts_older_types(cable: Cable) -> None:
             await publisher.publish(sent)
             assert await angles.fetch(GUARD) == Radians(0.5)
             assert angles.undecodable == 0
-        other = bob.subscribe("other", Radians, accept=convert)
-        numbers = alice.advertise("other", r2p.msg.Float32)
-        await numbers.wait_subscriber()
-        await other.wait_publisher()
-        await numbers.publish(r2p.msg.Float32(1.0))
-        await until(lambda: other.queue)
-        with pytest.raises(TimeoutError):
-            await other.fetch(0.001)
-        assert other.undecodable == 1
+
+
+@conforms
+async def test_another_type_than_those_that_are_accepted_is_refused(cable: Cable) -> None:
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        await acquainted(a, b)
+        events = b.events()
+        angles = bob.subscribe("angle", Radians, accept={Degrees: lambda old: Radians(old.degrees / 2)})
+        numbers = alice.advertise("angle", r2p.msg.Float32)
+        mismatched = await first(events, Mismatched)
+        assert (mismatched.topic, mismatched.role) == ("angle", ROLE_PUBLISHES)
+        assert "publish messages of 4 bytes that are not accepted here: add their type to" in mismatched.describe()
+        numbers.close()
+        with pytest.raises(TimeoutError, match="angle"):
+            await angles.fetch(0.001)
+        degrees = alice.advertise("angle", Degrees)
+        await degrees.wait_subscriber()
+        await angles.wait_publisher()
+        await degrees.publish(Degrees(1.0))
+        assert await angles.fetch(GUARD) == Radians(0.5)
+        assert angles.undecodable == 0
 
 
 @conforms

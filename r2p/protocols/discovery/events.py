@@ -37,12 +37,14 @@ COMMAND_OF_TYPE: dict[int, Command] = dict(zip(management.ORDER_TYPES, MESSAGE_O
 class TopicType(msgspec.Struct, frozen=True):
     """The type of a topic as far as it is known: payload bytes (0: unknown) and fingerprint (`ANY_TYPE`: unknown).
 
-    If the length `varies`, `size` is a bound, which need not be the same in all modules.
+    If the length `varies`, `size` is a bound, which need not be the same in all modules. A subscriber that accepts
+    several types asks for none of them, and has them in `accepted`, which no message carries.
     """
 
     size: int = 0
     fingerprint: bytes = management.ANY_TYPE
     varies: bool = False
+    accepted: tuple["TopicType", ...] = ()
 
     @classmethod
     def announced(cls, size: int, fingerprint: bytes = management.ANY_TYPE) -> Self:
@@ -62,6 +64,8 @@ class TopicType(msgspec.Struct, frozen=True):
 
     def fits(self, other: "TopicType") -> bool:
         """Return whether the two agree: what is unknown fits everything."""
+        if self.accepted:
+            return any(each.fits(other) for each in self.accepted)
         ours, theirs = (self.exact_size or self.varies), (other.exact_size or other.varies)
         if ours and theirs and (ours, self.varies) != (theirs, other.varies):
             return False
@@ -194,6 +198,11 @@ class Mismatched(msgspec.Struct, frozen=True):
 def describe_mismatch(role: int, ours: TopicType, theirs: TopicType) -> str:
     """Describe how the type of peers in a role differs from this module's, and what to do about it."""
     verb = "publish" if role == management.ROLE_PUBLISHES else "subscribe to"
+    if ours.accepted:
+        what = "of variable length" if theirs.varies else f"of {theirs.size} bytes" if theirs.size else "of a type"
+        return (
+            f"others {verb} messages {what} that are not accepted here: add their type to accept=, or rename the topic"
+        )
     if ours.varies and theirs.varies:
         what = "another layout"
     elif ours.varies:

@@ -182,13 +182,14 @@ class DiscoveryProtocol(ABC):
         fingerprint: bytes = ANY_TYPE,
         *,
         varies: bool = False,
+        accepted: tuple[TopicType, ...] = (),
     ) -> list[Event]:
-        """Subscribe to a topic; size 0 and no fingerprint take every type.
+        """Subscribe to a topic; size 0 and no fingerprint take every type, or those that are `accepted`.
 
         `queue`: how many messages a publisher may have on the way to this module. Management messages bound it by what
         firmware has memory for (`queue_length`); for tokens 0 is any number, as the module would rather lose some.
         """
-        own = LocalTopic(TopicType(size, fingerprint, varies), queue=queue)
+        own = LocalTopic(TopicType(size, fingerprint, varies, accepted), queue=queue)
         return self._set_topic(now, topic, ROLE_SUBSCRIBES, own)
 
     def unsubscribe(self, now: int, topic: str) -> list[Event]:
