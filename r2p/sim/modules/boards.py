@@ -10,6 +10,7 @@ What firmware has in its configuration are parameters of the nodes: they set the
 import asyncio
 import functools
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -21,6 +22,7 @@ from r2p.clock import Ticker
 from r2p.codecs.management import FLAG_BOOT, FLAG_LOADER, FLAG_REBOOTED
 from r2p.modules.supervisor import NodeFunction
 from r2p.msg import Battery, Encoder, Float32, Led, PowerEvent, Setpoint
+from r2p.parameters.sources import GivenParameters
 from r2p.sim.modules.boot import BoardBoot
 from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Threshold
 from r2p.sim.physics.world import ADC_MAX, ADC_REFERENCE, adc_counts
@@ -74,6 +76,13 @@ class Plant:
         self.step(1 + min(skipped, round(_CATCH_UP / self.dt)))
 
 
+class ParameterOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """What the parameters of boards are at first: `params` of `r2p.Module` by the board's name, and `params_file`."""
+
+    params: Mapping[str, GivenParameters] = {}
+    params_file: Path | None = None
+
+
 class Board(r2p.Module):
     """A hardware module with its node functions by name; more can be started once it is open, as on any module.
 
@@ -89,8 +98,18 @@ class Board(r2p.Module):
         remap: dict[str, str] | None = None,
         nodes: Mapping[str, NodeFunction] | None = None,
         bridge: bool | BridgeOptions = False,
+        parameters: ParameterOptions | None = None,
     ) -> None:
-        super().__init__(name, via=via, remap=remap, watchdog=False, bridge=bridge)
+        given = parameters or ParameterOptions()
+        super().__init__(
+            name,
+            via=via,
+            remap=remap,
+            watchdog=False,
+            bridge=bridge,
+            params=given.params.get(name),
+            params_file=given.params_file,
+        )
         self.boot = BoardBoot()
         """The loader and the apps. Another run of the same hardware gets those of the previous one."""
         self.boot_loader = self.bootload
@@ -301,13 +320,14 @@ class MotorModule(Board):
         config: MotorConfig | None = None,
         via: Via = None,
         remap: dict[str, str] | None = None,
+        parameters: ParameterOptions | None = None,
     ) -> None:
         config = config or MotorConfig()
         nodes = {
             "motor": functools.partial(motor, drive=drive, config=config),
             "monitor": functools.partial(monitor, drive=drive, config=config),
         }
-        super().__init__(name, via=via, remap=remap, nodes=nodes)
+        super().__init__(name, via=via, remap=remap, parameters=parameters, nodes=nodes)
 
 
 class Pins:
@@ -368,9 +388,10 @@ class IoModule(Board):
         nodes: Mapping[str, Callable[..., Awaitable[object]]] | None = None,
         via: Via = None,
         remap: dict[str, str] | None = None,
+        parameters: ParameterOptions | None = None,
     ) -> None:
         programs = {each: functools.partial(function, pins=pins) for each, function in (nodes or {}).items()}
-        super().__init__(name, via=via, remap=remap, nodes=programs)
+        super().__init__(name, via=via, remap=remap, parameters=parameters, nodes=programs)
 
 
 def measured(battery: LeadBattery) -> Battery:
@@ -455,13 +476,14 @@ class PowerModule(Board):
         period: float = 0.5,
         via: Via = None,
         remap: dict[str, str] | None = None,
+        parameters: ParameterOptions | None = None,
     ) -> None:
         """`period` in seconds."""
         nodes = {
             "power": functools.partial(power, battery=battery, topic=topic, period=period),
             "limits": functools.partial(limits, battery=battery, topic="power_event"),
         }
-        super().__init__(name, via=via, remap=remap, nodes=nodes)
+        super().__init__(name, via=via, remap=remap, parameters=parameters, nodes=nodes)
 
 
 class GatewayModule(Board):
@@ -477,7 +499,8 @@ class GatewayModule(Board):
         via: str | Transport,
         outside: Iterable[str | Transport] = (),
         options: BridgeOptions | None = None,
+        parameters: ParameterOptions | None = None,
     ) -> None:
         """`options`: rules for forwarding, by default everything but commands. Raises as `r2p.Module` does."""
         links = [via, *outside]
-        super().__init__(name, via=links, bridge=False if len(links) == 1 else options or True)
+        super().__init__(name, via=links, bridge=len(links) > 1 and (options or True), parameters=parameters)

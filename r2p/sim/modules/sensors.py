@@ -13,7 +13,7 @@ import msgspec
 
 import r2p
 from r2p.msg import IMU, IMURaw9, Pressure, Proximity, Tilt
-from r2p.sim.modules.boards import Board, Via, paced, reopens
+from r2p.sim.modules.boards import Board, ParameterOptions, Via, paced, reopens
 from r2p.sim.physics.inertial import (
     ACCELEROMETER,
     BAROMETER_NOISE,
@@ -113,10 +113,11 @@ class ProximityModule(Board):
         period: float = 0.05,
         via: Via = None,
         remap: dict[str, str] | None = None,
+        parameters: ParameterOptions | None = None,
     ) -> None:
         """`period` in seconds: the sensors need 40 ms for a measurement."""
         node = functools.partial(proximity, sensors=sensors, topic=topic, period=period)
-        super().__init__(name, via=via, remap=remap, nodes={"prox": node})
+        super().__init__(name, via=via, remap=remap, parameters=parameters, nodes={"prox": node})
 
 
 class Motion(msgspec.Struct, frozen=True):
@@ -239,6 +240,7 @@ class ImuModule(Board):
         topics: Iterable[str] = ("imu", "imu_raw", "tilt", "pressure"),
         via: Via = None,
         remap: dict[str, str] | None = None,
+        parameters: ParameterOptions | None = None,
     ) -> None:
         """`period` in seconds, of all topics but `pressure`, which has 25 Hz; `topics`: those to publish."""
         streams: dict[str, tuple[type[r2p.Message], Callable[[], r2p.Message], float]] = {
@@ -251,4 +253,4 @@ class ImuModule(Board):
         for topic in topics:
             message, fill, each = streams[topic]
             nodes[topic] = functools.partial(readings, topic=topic, type=message, fill=fill, period=each)
-        super().__init__(name, via=via, remap=remap, nodes=nodes)
+        super().__init__(name, via=via, remap=remap, parameters=parameters, nodes=nodes)

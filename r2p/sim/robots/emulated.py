@@ -28,6 +28,7 @@ from r2p.sim.modules.boards import (
     GatewayModule,
     MotorConfig,
     MotorModule,
+    ParameterOptions,
     Plant,
     PowerModule,
 )
@@ -97,8 +98,9 @@ class Triskar2:
     """The robot, on the network `via`, for the time of an `async with` block.
 
     `traffic` is the class of all messages of the command chain; None: the nodes' defaults. `modules`: the modules to
-    run in this process; default: all. `outside`: the gateway's links for computers, with these `options`. Raises
-    InvalidName for a module that the robot does not have, and TransportError for an invalid `via`.
+    run in this process; default: all. `outside`: the gateway's links for computers, with these `options`. `parameters`:
+    what the modules' parameters are at first, and the file that all of them save to. Raises InvalidName for a module
+    that the robot does not have, and TransportError for an invalid `via`.
     """
 
     def __init__(
@@ -111,10 +113,12 @@ class Triskar2:
         modules: Iterable[str] | None = None,
         outside: Iterable[str | Transport] = (),
         options: BridgeOptions | None = None,
+        parameters: ParameterOptions | None = None,
     ) -> None:
         self.via = via
         self.outside = list(outside)
         self._options = options
+        self._parameters = parameters
         self.hardware = Hardware(seed, world)
         self.modules: dict[str, Board] = {}
         """The modules that are switched on, by name."""
@@ -212,10 +216,14 @@ class Triskar2:
         await board.__aexit__(None, None, None)
 
     def _gateway(self, name: str) -> GatewayModule:
-        return GatewayModule(name, via=self.via, outside=self.outside, options=self._options)
+        return GatewayModule(
+            name, via=self.via, outside=self.outside, options=self._options, parameters=self._parameters
+        )
 
     def _power_supply(self, name: str) -> PowerModule:
-        return PowerModule(name, battery=self.hardware.battery, topic="power", via=self.via)
+        return PowerModule(
+            name, battery=self.hardware.battery, topic="power", via=self.via, parameters=self._parameters
+        )
 
     def _motor(self, name: str) -> MotorModule:
         wheel = MOTORS.index(name)
@@ -229,7 +237,9 @@ class Triskar2:
             period=triskar2.PERIOD,
             current=f"current{wheel + 1}",
         )
-        return MotorModule(name, drive=self.hardware.drives[wheel], config=config, via=self.via)
+        return MotorModule(
+            name, drive=self.hardware.drives[wheel], config=config, via=self.via, parameters=self._parameters
+        )
 
     def _proximity(self, name: str) -> ProximityModule:
         topic = PROXIMITY[name]
@@ -239,7 +249,7 @@ class Triskar2:
             return self.hardware.distance_to_wall(ahead + triskar2.BEARINGS[number])
 
         sensors = RangeArray(distance_to, self.hardware.noise(name))
-        return ProximityModule(name, sensors=sensors, topic=topic, via=self.via)
+        return ProximityModule(name, sensors=sensors, topic=topic, via=self.via, parameters=self._parameters)
 
 
 def _check_name(name: str) -> None:
