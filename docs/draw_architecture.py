@@ -15,7 +15,7 @@ PICTURE = Path(__file__).parent / "assets" / "architecture.svg"
 
 LAYERS: dict[str, tuple[str, ...]] = {
     "Commands, test tools": ("tools", "testing"),
-    "Simulation": ("sim", "sim.can", "sim.modules", "sim.physics", "sim.robots"),
+    "Simulation, boot loader": ("sim", "sim.can", "sim.modules", "sim.physics", "sim.robots", "loader"),
     "Modules": ("modules", "bus"),
     "Gateways": ("bridge",),
     "Links": ("transports", "transports.can", "transports.rtcan", "transports.zenoh"),
