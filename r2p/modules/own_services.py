@@ -50,6 +50,7 @@ _TRIES = 3  # times that a content is fetched from its beginning, if its module 
 _REMEMBERED = 10 * SECOND  # ns for which an answer is remembered
 _CHANGE_REMEMBERED = 60 * SECOND  # ... and that of a change: nothing on the way holds a request back for so long
 _RUNNING_MAX = 64  # handlers that run at once
+_REFUSALS = (Error, LookupError, ValueError)  # what a handler raises for its caller
 _REFUSALS_APART = 60 * SECOND  # ns between two lines of the log about changes that one link lacks the permission for
 _CONTENTS_MAX = 64  # contents of several pages that are kept: the latest of each caller and argument
 
@@ -163,8 +164,12 @@ class OwnServices:
         return content
 
     async def _call_own(self, operation: Operation, argument: bytes) -> bytes:
-        made = self._handlers[operation](argument)
-        return made if isinstance(made, bytes) else await made
+        """Have a handler of this module make the content. Raises ServiceError with the text of its error."""
+        try:
+            made = self._handler(operation)(argument)
+            return made if isinstance(made, bytes) else await made
+        except _REFUSALS as error:
+            raise ServiceError(_text(error)) from error
 
     async def _fetch_edition(self, instance: int, operation: Operation, argument: bytes) -> bytes | None:
         """Return the content; None if the module has forgotten it meanwhile."""
@@ -276,6 +281,9 @@ class OwnServices:
     def _answer(self, link: Link, call: OwnCall, source: Hashable) -> bytes | None:
         """Return the answer to a request, the same for each repetition of it; None: a handler begins to work on it."""
         caller, number, now = call.header.instance, call.header.number, self._clock.monotonic()
+        refusal = self._refusal(link, call)
+        if refusal:  # not remembered: it costs nothing to make, and displaces no answer of those that may
+            return self._refuse(link, call, refusal)
         running = self._running.get((caller, number, call.operation))
         if running is not None:
             running.link, running.source = link, source
@@ -284,13 +292,16 @@ class OwnServices:
         known = answers.get(caller, number, now, lifetime)
         if known is not None:
             return known
-        refusal = self._refusal(link, call)
-        if refusal:  # not remembered: it costs nothing to make, and displaces no answer of those that may
-            return self._refuse(link, call, refusal)
         answer = self._make_answer(link, call, source)
         if answer is not None:
             answers.put(caller, number, answer, now, lifetime)
         return answer
+
+    def _handler(self, operation: int) -> Handler:
+        handler = self._handlers.get(operation)
+        if handler is None:
+            raise LookupError(f"operation {operation} is unknown to this version of r2p")
+        return handler
 
     def _remembered(self, call: OwnCall) -> tuple[RememberedAnswers, int]:
         """Return the memory for the answer to a request, and for how long it stays there (ns)."""
@@ -301,10 +312,7 @@ class OwnServices:
         try:
             if call.page:
                 return self._page(call, self._kept(call))
-            handler = self._handlers.get(call.operation)
-            if handler is None:
-                raise LookupError(f"operation {call.operation} is unknown to this version of r2p")
-            made = handler(call.body)
+            made = self._handler(call.operation)(call.body)
             if isinstance(made, bytes):
                 return self._page(call, self._keep(call, made))
             if self.tasks is None or len(self._running) >= _RUNNING_MAX:
@@ -322,6 +330,10 @@ class OwnServices:
         """Answer a request when its handler has ended, by the link by which it was repeated last."""
         try:
             answer = self._page(call, self._keep(call, await making))
+        except asyncio.CancelledError:
+            if self.tasks is None:
+                raise  # the module ends
+            answer = self._error(running.link, call, ServiceError("it was cancelled there"))  # or it would run again
         except Exception as error:  # noqa: BLE001 - the caller learns of it
             answer = self._error(running.link, call, error)
         finally:
@@ -359,9 +371,8 @@ class OwnServices:
 
     def _error(self, link: Link, call: OwnCall, error: Exception) -> bytes:
         """Return the answer with the text of an error."""
-        if isinstance(error, Error | LookupError | ValueError):
-            text = str(error.args[0] if error.args else type(error).__name__)
-            return self._reply(call, Kind.ERROR, services.encode_text(text, PAGE_MAX))
+        if isinstance(error, _REFUSALS):
+            return self._reply(call, Kind.ERROR, services.encode_text(_text(error), PAGE_MAX))
         link.stats.lost.internal_error(error)
         return self._reply(call, Kind.ERROR, b"internal error: the log of the module has it")
 
@@ -404,6 +415,10 @@ def may_answer(link: Link, info: ModuleInfo) -> bool:
         return False
     gateways = [each.wire for each in link.discovery.modules.values() if each.gateway] if info.hops else []
     return not gateways or max(gateways) >= WIRE_MIN
+
+
+def _text(error: Exception) -> str:
+    return str(error.args[0] if error.args else type(error).__name__)
 
 
 def _with_instance(link: Link, instance: int) -> Iterator[ModuleInfo]:

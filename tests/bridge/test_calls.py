@@ -20,7 +20,7 @@ from r2p.testing.network import node_in
 from r2p.transports.memory import MemoryNetwork, MemoryTransport
 from tests.bridge.test_topologies import CALM, populate, trouble
 from tests.bridge.world import World
-from tests.modules.test_changes import KEY, OTHER, TEST, Desk, KeyedCable, knows
+from tests.modules.test_changes import KEY, OTHER, TEST, Desk, IpLine, KeyedCable, knows
 from tests.modules.test_own_services import WIDE, Stranger, Wide, knows_wide, services
 from tests.transports.cables import LineCable
 from tests.transports.rtcan.networks import until
@@ -107,14 +107,6 @@ async def test_a_link_onto_which_nothing_may_go_gets_no_answer() -> None:
 
 
 # Changes
-
-
-class IpLine(LineCable):
-    """A line in this process that counts as one of an IP network."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._a.name = self._b.name = "tcp:robot"
 
 
 class Chain:

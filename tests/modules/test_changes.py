@@ -132,9 +132,23 @@ async def test_what_a_handler_raises_is_the_answer_also_after_a_while() -> None:
 
         services(a).serve(TEST, refuse)
         for caller in (a, b):
-            with pytest.raises(r2p.Error, match="kp is at most 10, not 70"):
+            with pytest.raises(ServiceError, match="kp is at most 10, not 70"):
                 await services(caller).change(a.instance, TEST, b"70")
         assert ran == 2
+
+        async def cancelled(argument: bytes) -> bytes:
+            nonlocal ran
+            ran += 1
+            await asyncio.sleep(0.5)
+            raise asyncio.CancelledError
+
+        services(a).serve(TEST, cancelled)
+        with pytest.raises(ServiceError, match="it was cancelled there"):
+            await services(b).change(a.instance, TEST, b"70")
+        assert ran == 3
+        for caller in (a, b):
+            with pytest.raises(ServiceError, match="operation 249 is unknown to this version of r2p"):
+                await services(caller).change(a.instance, cast("Operation", 249))
 
 
 @pytest.mark.virtual_time
@@ -236,6 +250,31 @@ def test_links_of_ip_networks_need_permission(
                 await services(caller).fetch(server.instance, Operation.STATISTICS)
 
     Setup(cable, uvloop.new_event_loop).run(test)
+
+
+class IpLine(LineCable):
+    """A line in this process that counts as one of an IP network."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._a.name = self._b.name = "tcp:robot"
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("operation", [each for each in Operation if each.changes])
+async def test_every_operation_that_changes_something_needs_permission(operation: Operation) -> None:
+    unknown, refused = "unknown to this version", "A refuses changes from tcp: start it with --allow-control"
+    for allowed in (False, True):
+        line = IpLine()
+        async with r2p.Module("A", via=line.a(), allow_control=allowed) as a, r2p.Module("B", via=line.b()) as b:
+            await until(lambda b=b, a=a: knows(b, a))  # type: ignore[misc]
+            try:
+                text = str(await services(b).change(a.instance, operation))
+            except ServiceError as error:
+                text = str(error)
+            assert (refused in text) is not allowed
+            assert unknown not in text
+            assert a.links[0].losses["change refused"] == (not allowed)
 
 
 @pytest.mark.virtual_time
