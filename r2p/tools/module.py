@@ -77,6 +77,7 @@ async def info(session: Session, module: Name, *, wait: Wait = None, format: For
     view = _find(session, module)
     if view is None:
         raise r2p.Error(_unknown_text(session, module))
+    module = view.name
     record = _row(view, for_people=output.format == "text")
     if view.instance is None:
         notify(f"{module} is firmware: it counts nothing that others can ask for")
@@ -141,17 +142,19 @@ async def _send(session: Session, command: r2p.Command, name: str, timeout: floa
     finally:
         watching.cancel()
         sender.close()
-    notify(f"{name}: {_DONE[command]} after {loop.time() - started:.1f} s")
+    notify(f"{sender.name}: {_DONE[command]} after {loop.time() - started:.1f} s")
 
 
 class _CommandSender:
     """Sends one command to a module, and watches what the module does since."""
 
     def __init__(self, session: Session, command: r2p.Command, name: str) -> None:
+        view = _find(session, name)
+        self.name = name if view is None else view.name
+        """The name of the module; what the user has given, which may be its alias, until the module is known."""
         self._session = session
         self._command = command
-        self._name = name
-        self._flags = [_flags(view) for view in [_find(session, name)] if view is not None]  # in order
+        self._flags = [] if view is None else [_flags(view)]  # in order
         self._sent_at = 0.0
         self._denied = ""  # why a gateway does not forward the command
         self._settled = asyncio.create_task(session.settled())
@@ -163,16 +166,17 @@ class _CommandSender:
     def awaited(self) -> str:
         """Say what the command waits for."""
         if self._flags:
-            return f"{self._name} to confirm {self._command.name}"
+            return f"{self.name} to confirm {self._command.name}"
         if not self._may_be_firmware():
-            return f"{self._name} to announce itself"
-        return f"{self._name} (firmware announces itself within {_ROUND:g} s)"
+            return f"{self.name} to announce itself"
+        return f"{self.name} (firmware announces itself within {_ROUND:g} s)"
 
     async def watch(self, events: AsyncIterator[r2p.ModuleEvent]) -> None:
         """Note each change of the module's flags, and whether a gateway denies the command."""
         async for event in events:
             match event:
-                case r2p.ModuleChanged(info=info) if info.name == self._name:
+                case r2p.ModuleChanged(info=info) if self.name in (info.name, module_alias(info.name)):
+                    self.name = info.name
                     self._flags.append(info.flags)
                 case r2p.LinkNotice(kind=kind, text=text) if kind == f"{self._command.name} denied":
                     self._denied = text
@@ -185,11 +189,11 @@ class _CommandSender:
         await wait_until(lambda: bool(self._flags) or self._is_unknown(), _FIRST_STATE)
         while True:
             if self._is_unknown():
-                raise r2p.Error(_unknown_text(self._session, self._name))
+                raise r2p.Error(_unknown_text(self._session, self.name))
             self._check_has_loader()
             if not self._flags:
                 self._session.module.query()  # again: a gateway may not have heard the first one
-            self._session.module.command(self._command, self._name)
+            self._session.module.command(self._command, self.name)
             self._sent_at = asyncio.get_running_loop().time()
             if await wait_until(self._is_over, _REPEAT) and not self._is_unknown():
                 break
@@ -198,9 +202,9 @@ class _CommandSender:
 
     def _check_has_loader(self) -> None:
         """Raise r2p.Error if the command needs a boot loader, and the module has none."""
-        view = _find(self._session, self._name)
+        view = _find(self._session, self.name)
         if self._command is r2p.Command.BOOTLOAD and view is not None and not view.has_loader:
-            raise r2p.Error(f"{self._name} is an r2p module, a program without a boot loader: it would refuse BOOTLOAD")
+            raise r2p.Error(f"{self.name} is an r2p module, a program without a boot loader: it would refuse BOOTLOAD")
 
     def _is_over(self) -> bool:
         return bool(self._denied) or self._confirmed() or self._is_unknown()
@@ -232,7 +236,7 @@ class _CommandSender:
             return False
         if any(_restarted(after) and not _restarted(before) for before, after in pairwise(self._flags)):
             return True
-        view = _find(self._session, self._name)
+        view = _find(self._session, self.name)
         if view is None or view.instance is not None:
             return False
         return 0 <= asyncio.get_running_loop().time() - view.age - self._sent_at < _PROMPT
@@ -248,8 +252,18 @@ def _flags(view: r2p.ModuleView) -> int:
 
 
 def _find(session: Session, name: str) -> r2p.ModuleView | None:
-    """Return the module as it was last seen, on any link."""
-    views = [view for view in session.module.network.modules() if view.name == name and view.link]
+    """Return the module of this name, or with this alias, as it was last seen, on any link.
+
+    Raises r2p.Error for the alias of several modules.
+    """
+    known = [view for view in session.module.network.modules() if view.link]
+    views = [view for view in known if view.name == name]
+    views = views or [view for view in known if module_alias(view.name) == name]
+    if views and views[0].name != name:
+        others = {link.discovery.other_module(view.name) for link in session.module.links for view in views}
+        names = sorted({view.name for view in views} | others - {""})
+        if len(names) > 1:
+            raise r2p.Error(f"{name} is the alias of {' and '.join(names)}: rename one (--module)")
     return min(views, key=lambda view: view.age, default=None)
 
 

@@ -14,11 +14,13 @@ import pytest
 import r2p
 from r2p.codecs import management
 from r2p.msg import Led, Velocity3
+from r2p.names import module_alias
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
 from r2p.tools.module import bootload, info, list_, reboot, stop
 from r2p.tools.session import Session, Settings, TimedOut, UsageError
 from r2p.transports.memory import Datagram, network
 from tests.tools.rig import printed, robot, tool
+from tests.transports.test_aliases import OTHER_WHEEL, WHEEL
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -51,6 +53,30 @@ async def test_r2p_modules_are_listed(capsys: pytest.CaptureFixture[str]) -> Non
         ("ARM", "stopped", "r2p", "memory:lab"),
         ("BOT", "running", "r2p", "memory:lab"),
     ]
+
+
+async def test_an_alias_is_a_name(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "front_left_wheel_controller"
+    async with robot(hold, name=name) as module, tool() as session:
+        alias = module_alias(name)
+        await info(session, alias)
+        (record,) = printed(capsys)
+        assert (record["module"], record["nodes"][0]["node"]) == (name, "hold")
+        await stop(session, alias)
+        assert module.stopped
+        await reboot(session, alias)
+        assert module.rebooted
+        assert capsys.readouterr().err.splitlines()[-1].startswith(f"r2p: {name}: rebooted after")
+        with pytest.raises(r2p.Error, match=f"{name} is an r2p module, a program without a boot loader"):
+            await bootload(session, alias)
+
+
+async def test_an_alias_of_two_modules_is_the_name_of_none() -> None:
+    async with robot(hold, name=WHEEL), robot(name=OTHER_WHEEL), tool() as session:
+        alias = module_alias(WHEEL)
+        for command in (info, stop):
+            with pytest.raises(r2p.Error, match=f"{alias} is the alias of {WHEEL} and {OTHER_WHEEL}: rename one"):
+                await command(session, alias)
 
 
 async def test_what_a_module_has_counted(capsys: pytest.CaptureFixture[str]) -> None:

@@ -189,6 +189,10 @@ class LinkNames:
             self._give(key, heir)
             self.emit(AliasFreed(heir))
 
+    def owns(self, topic: str) -> bool:
+        """Return whether this module uses the topic, and no other topic of its own has the alias."""
+        return self._own.get((KIND_TOPIC, self.alias(KIND_TOPIC, topic))) == topic
+
     def rival(self, topic: str) -> str:
         """Return another name with the alias of this topic, which the link can't carry then; empty without one."""
         key = KIND_TOPIC, self.alias(KIND_TOPIC, topic)
@@ -197,6 +201,12 @@ class LinkNames:
             return owner
         rival = self._rivals.get(key, "")
         return "" if key[1] in (topic, rival) else rival
+
+    def topics(self, alias: str) -> set[str]:
+        """Return the names of topics that are known to have this alias, or to be it; of several none is believed."""
+        key = KIND_TOPIC, alias
+        known = {self._own.get(key, ""), self._learnt.get(key, ""), self._rivals.get(key, "")}
+        return (known | self._waiting.get(key, {}).keys()) - {""}
 
     def _give(self, key: _Key, name: str) -> None:
         """Give an alias to a name of this module."""

@@ -83,6 +83,8 @@ class Announcer:
         self._relayed: dict[tuple[str | int, ...], Relayed] = {}
         self._relayed_names: dict[tuple[str | int, ...], list[_KindName]] = {}
         """The names in relayed endpoints, by the key of each."""
+        self._claimed: set[str] = set()
+        """Topics whose names are announced, also while the link does not carry them as another one has the alias."""
         self._long_names: Counter[_KindName] = Counter()
         """Names that travel as aliases, and how many announcements have each."""
 
@@ -177,6 +179,17 @@ class Announcer:
     def announce_name(self, kind: int, name: str) -> None:
         """Announce once that this module has a topic of a short name, which is also the alias of another one."""
         self.announce_once(ItemKind.LONG_NAME, kind, name, 0)
+
+    def set_claimed(self, topic: str, *, claimed: bool) -> None:
+        """Announce the name of a topic for as long as this module uses it: so both modules with an alias stay refused,
+        and tools that come later learn why.
+        """
+        if claimed and topic not in self._claimed:
+            self._claimed.add(topic)
+            self._add_name(KIND_TOPIC, topic)
+        elif not claimed and topic in self._claimed:
+            self._claimed.remove(topic)
+            self._drop_name(KIND_TOPIC, topic)
 
     def _add_name(self, kind: int, name: str) -> None:
         """Announce the name behind an alias for as long as anything announced has the alias."""

@@ -143,6 +143,10 @@ class DiscoveryProtocol(ABC):
         """Stop using the name of a topic."""
         return []
 
+    def topics_with_alias(self, alias: str) -> set[str]:
+        """Return the topics that are known to have this alias; several can't be told apart on this link."""
+        return set()
+
     def rival(self, topic: str) -> str:
         """Return the other name with the alias of this topic, so that the link can't carry it; empty: it can."""
         return ""
@@ -373,11 +377,16 @@ class Discovery(DiscoveryProtocol):
 
     def claim(self, topic: str) -> list[Event]:
         self._names.claim(KIND_TOPIC, topic)
+        self._announcer.set_claimed(topic, claimed=self._names.owns(topic))
         return self._outbox.drain()
 
     def release(self, topic: str) -> list[Event]:
         self._names.release(KIND_TOPIC, topic)
+        self._announcer.set_claimed(topic, claimed=False)
         return self._outbox.drain()
+
+    def topics_with_alias(self, alias: str) -> set[str]:
+        return self._names.topics(alias)
 
     def rival(self, topic: str) -> str:
         return self._names.rival(topic)

@@ -1,7 +1,7 @@
 """`r2p topic list`, `info` and `find`: what is known about topics."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 import typer
@@ -49,15 +49,18 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
     """
     output = Output(format)
     await session.settle(wait)
-    views = session.module.network.topics()
-    view = views.get(topic_name(topic)) or _with_alias(session, topic_name(topic), views.values())
+    views, name = session.module.network.topics(), topic_name(topic)
+    collisions = _collisions(session, name)
+    view = views.get(name) or _with_alias(session, name, views.values())
+    if view is None and collisions:  # without its name, which is not believed, it is known as the alias
+        view = views.get(chosen_alias(name, session.settings.aliases))
     if view is None:
-        question = suggest_topics(session, topic_name(topic), lambda view: True)
-        known = question or f"; known topics: {', '.join(views) or 'none'}"
-        raise r2p.Error(f"{topic} has no publisher and no subscriber{known}")
+        raise r2p.Error(_unknown_text(session, name, views, collisions))
+    for text in dict.fromkeys(collisions.values()):
+        notify(text)
     if view.mismatch:
         notify(f"{topic} has different types: some of these nodes can't exchange messages")
-    details = await _details(session, view)
+    details = await _details(session, view, collisions)
     if session.verbose:
         age = None if view.age is None else round(view.age, 3)
         details["age"] = f"{age} s" if output.format == "text" else age
@@ -97,6 +100,29 @@ async def find(
     await put_sizes(output, rows, session.columns(*_COLUMNS, "match"))
     if not rows:
         raise r2p.Error(session.none_yet(f"topics of type {what}"))
+
+
+def _unknown_text(session: Session, name: str, views: Mapping[str, r2p.TopicView], collisions: dict[str, str]) -> str:
+    question = suggest_topics(session, name, lambda view: True)
+    known = question or f"; known topics: {', '.join(views) or 'none'}"
+    reason = next((f"; {text}" for text in collisions.values()), known)
+    return f"{name} has no publisher and no subscriber{reason}"
+
+
+def _collisions(session: Session, name: str) -> dict[str, str]:
+    """Return the links on which another topic has the same alias as this one, and what to do about it."""
+    alias = chosen_alias(name, session.settings.aliases)
+    collisions = {}
+    for link in session.module.links:
+        names = link.discovery.topics_with_alias(alias)
+        names |= {name} if name != alias and names else set()
+        if len(names) > 1:
+            one, other, *_ = sorted(names)
+            collisions[link.name] = (
+                f"topics {one} and {other} have one alias, {alias}: choose another one for either, in [alias] of "
+                "r2p.toml, or with aliases= of Module"
+            )
+    return collisions
 
 
 def _alias(session: Session, view: r2p.TopicView) -> dict[str, Any]:
@@ -149,7 +175,7 @@ def endpoints_of(session: Session, known: list[r2p.Endpoint], links: list[str]) 
     return found + [{"node": f"{module}/?", "class": None, "link": link} for link, module in rest]
 
 
-async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:
+async def _details(session: Session, view: r2p.TopicView, collisions: dict[str, str]) -> dict[str, Any]:
     types = Types(session.settings)
     cls = await types.learn(session, view)
     publishers = endpoints_of(session, view.publishers, view.published_on)
@@ -158,7 +184,7 @@ async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:
         "fingerprint": None if view.fingerprint is None else view.fingerprint.hex(),
         "publishers": publishers,
         "subscribers": [{key: each[key] for key in ("node", "link")} for each in subscribers],
-        "guarantees": _guarantees(session, view),
+        "guarantees": _guarantees(session, view, collisions),
     }
     if session.verbose:
         details |= _fields(cls, view)
@@ -173,15 +199,18 @@ def _fields(cls: type[r2p.Message] | None, view: r2p.TopicView) -> dict[str, Any
     return {"fields": None, "maybe": [] if view.varies else of_size(view.size)}
 
 
-def _guarantees(session: Session, view: r2p.TopicView) -> dict[str, str]:
+def _guarantees(session: Session, view: r2p.TopicView, collisions: dict[str, str]) -> dict[str, str]:
     """Return what each link guarantees to the classes of the publishers, as far as they are known."""
     classes = {each.publisher_class for each in view.publishers if each.publisher_class is not None}
     guarantees = {}
     for link in session.module.links:
         for publisher_class in sorted(classes or {r2p.PublisherClass.NON_REAL_TIME}):
-            guarantees[f"{link.name} {CLASS_NAMES[publisher_class]}"] = _carried(
+            guarantee = _carried(
                 link.refusal(view.size, varies=view.varies), link.guarantee(view.name, publisher_class), view
             )
+            if link.name in collisions:
+                guarantee = "carried for one of the topics with its alias, or for none"
+            guarantees[f"{link.name} {CLASS_NAMES[publisher_class]}"] = guarantee
     return guarantees
 
 

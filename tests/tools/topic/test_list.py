@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 from typing import Annotated, Any
 
@@ -10,11 +11,13 @@ import pytest
 
 import r2p
 from r2p.msg import LaserScan, Led, Velocity3
+from r2p.names import topic_alias
 from r2p.tools import module as modules
 from r2p.tools import node
 from r2p.tools.session import UsageError
 from r2p.tools.topic.list import find, info, list_
 from tests.tools.rig import VIA, Firmware, printed, robot, tool
+from tests.transports.test_aliases import ONE, OTHER
 
 FIXED = {"varies": False}
 
@@ -76,6 +79,27 @@ async def test_names_and_with_v_their_aliases(capsys: pytest.CaptureFixture[str]
         await modules.list_(session)
         (row,) = printed(capsys)
         assert (row["module"], row["alias"]) == (module, "frowhja")
+
+
+@pytest.mark.virtual_time
+async def test_info_names_both_topics_that_have_one_alias(capsys: pytest.CaptureFixture[str]) -> None:
+
+    async def publish(node: r2p.Node) -> None:
+        node.advertise(ONE, Led)
+        await asyncio.Event().wait()
+
+    async def subscribe(node: r2p.Node) -> None:
+        await node.subscribe(OTHER, Led).fetch()
+
+    async with robot(publish, name="A"), robot(subscribe, name="B"), tool() as session:
+        await asyncio.sleep(5.0)
+        text = f"topics {ONE} and {OTHER} have one alias, {topic_alias(ONE)}: choose another one for either"
+        for name in (ONE, OTHER, topic_alias(ONE)):
+            await info(session, name)
+            captured = capsys.readouterr()
+            assert text in captured.err
+            guarantees = json.loads(captured.out)["guarantees"]
+            assert guarantees == {f"{VIA} nrt": "carried for one of the topics with its alias, or for none"}
 
 
 @pytest.mark.virtual_time
