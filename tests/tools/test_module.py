@@ -185,7 +185,7 @@ async def test_a_reboot_is_confirmed_by_what_happens_not_by_old_flags(monkeypatc
 async def test_a_gateway_that_refuses_an_order_says_so_at_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"memory"}))
+    monkeypatch.setattr("r2p.transports.url._IP", frozenset({"memory"}))
     gateway = r2p.Module("GW", via=["memory:lab", "memory:bus"], bridge=True)
     async with gateway, r2p.Module("IMU1", via="memory:bus"), tool() as session:
         await asyncio.sleep(3)
