@@ -294,11 +294,6 @@ def encode_text(text: str) -> bytes:
     return bytes((_fits(len(data), "bytes of UTF-8"),)) + data
 
 
-def decode_text(data: bytes) -> str:
-    """Decode a text. Raises DecodeError; what later versions add is left out."""
-    return _ValueReader(data).text()
-
-
 def encode_value(value: Plain | None, kind: ParameterKind | None = None) -> bytes:
     """Encode a value, of this kind or that of its type. Raises MessageError for one that can't be a parameter's."""
     kind = _kind_of(value) if kind is None or value is None else kind

@@ -61,8 +61,8 @@ class ParameterServices:
         services.serve(Operation.PARAMETER_RESET, self._reset)
 
     def _list(self, argument: bytes) -> bytes:
-        node = argument.decode(errors="replace") or None
-        return codec.encode_list(ParameterList(self._parameters.revision, True, [*self._parameters.infos(node)]))
+        infos = self._parameters.infos(_node(argument))
+        return codec.encode_list(ParameterList(self._parameters.revision, True, [*infos]))
 
     def _list_changes(self, argument: bytes) -> bytes:
         revision, parameters = codec.decode_count(argument), self._parameters
@@ -103,8 +103,7 @@ class ParameterServices:
         return codec.encode_count(await self._parameters.save())
 
     def _reset(self, argument: bytes) -> bytes:
-        node = codec.decode_text(argument) if argument else ""
-        return codec.encode_count(self._parameters.reset(node or None))
+        return codec.encode_count(self._parameters.reset(_node(argument)))
 
     def _find(self, number: int) -> _StagedSet:
         stage = self._stages.get(number)
@@ -121,6 +120,10 @@ class ParameterServices:
             number = self._random.randrange(1, _NUMBERS)
             if number not in self._stages:
                 return number
+
+
+def _node(argument: bytes) -> str | None:
+    return argument.decode(errors="replace") or None
 
 
 # The asking side
@@ -158,8 +161,7 @@ async def save(ask: Ask) -> int:
 async def reset(ask: Ask, module: str, node: str | None, names: Iterable[str] | None) -> int:
     """Reset parameters of a module; return how many. Raises ParameterError with its text."""
     if names is None:
-        argument = b"" if node is None else codec.encode_text(node)
-        return codec.decode_count(await _asked(ask, Operation.PARAMETER_RESET, argument))
+        return codec.decode_count(await _asked(ask, Operation.PARAMETER_RESET, (node or "").encode()))
     if node is None:
         raise ParameterError("reset with names= needs their node=, too")
     chosen = dict.fromkeys((node, name) for name in names)

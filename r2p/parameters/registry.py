@@ -101,7 +101,7 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
 
     def node_closed(self, owner: ParameterOwner) -> None:
         """End the iterators over changes: the node has ended, and may start again."""
-        for parameter in self._of(owner.name):
+        for parameter in (*self._of(owner.name), *self._replaced.values()):
             if parameter.owner is owner:
                 parameter.wake()
 
@@ -114,11 +114,20 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
         for name in [name for name in self._replaced if name[0] == node]:
             before = self._replaced.pop(name)
             if not before.owner.closed:  # the node goes on
-                self._parameters[name] = before
-                self._touch([name])
+                self._give_back(name, before)
         if gone:
             self._touch(())
             self.declared = self.revision
+
+    def _give_back(self, name: Name, before: Parameter[Any]) -> None:
+        """Let the parameter of a node that goes on count again, with what was set meanwhile if that fits."""
+        self._parameters[name] = before
+        self._touch([name])
+        value, origin = self._run_time.get(name, (before.value, before.origin_number))
+        try:
+            self._commit({name: (before.definition.convert(value), origin)})
+        except ParameterError:
+            del self._run_time[name]
 
     def unused(self) -> list[str]:
         """Return what options and files name that no node has declared, each with its source."""

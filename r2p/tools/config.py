@@ -17,8 +17,10 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from r2p.codecs.parameters import Name
 from r2p.errors import InvalidName
 from r2p.names import check_aliases, module_name, module_name_from, topic_name
+from r2p.parameters.sources import TABLE, read_tables
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -57,6 +59,9 @@ class ConfigFile(msgspec.Struct):
     remap: dict[str, str] = {}
     alias: dict[str, str] = {}
     launch: dict[str, LaunchTable] = {}
+    params_file: str | None = None
+    params: dict[str, dict[Name, Any]] = {}
+    """By module, then by (node, parameter)."""
 
 
 class Settings(msgspec.Struct):
@@ -69,6 +74,9 @@ class Settings(msgspec.Struct):
     aliases: dict[str, str] = {}
     via_source: str = "--via"
     """Where `via` is from, for errors."""
+    params_file: Path | None = None
+    params: dict[str, dict[Name, Any]] = {}
+    """Values of parameters: by module, then by (node, parameter)."""
 
 
 class Setting(msgspec.Struct, frozen=True):
@@ -90,7 +98,8 @@ def settings(via: list[str] | None = None, path: Path | None = None, *, tool: bo
     urls, source = _choose_via(via, path, file)
     if tool and source != "--via":
         urls = [_local_peer(url) for url in urls]
-    return Settings(urls, file.module, _types(path, file), file.remap, file.alias, source)
+    params_file = None if path is None or file.params_file is None else path.parent / file.params_file
+    return Settings(urls, file.module, _types(path, file), file.remap, file.alias, source, params_file, file.params)
 
 
 def list_settings(via: list[str] | None = None, path: Path | None = None) -> list[Setting]:
@@ -99,14 +108,20 @@ def list_settings(via: list[str] | None = None, path: Path | None = None) -> lis
     path = path or find()
     contents = _load(path) if path else {}
     file, name = _parse(path, contents) if path else ConfigFile(), path.name if path else ""
-    module = (file.module, name) if file.module else (module_name_from(socket.gethostname()), "default: the host name")
+    own = (file.module, name) if file.module else (module_name_from(socket.gethostname()), "default: the host name")
     return [
         Setting("file", path and str(path.absolute()), source if path else "default: none"),
         Setting("via", *_choose_via(via, path, file)),
-        Setting("module", *module),
+        Setting("module", *own),
         *(Setting(f"types.{topic}", text, name) for topic, text in _types(path, file).items()),
         *(Setting(f"remap.{topic}", text, name) for topic, text in file.remap.items()),
         *(Setting(f"alias.{topic}", text, name) for topic, text in file.alias.items()),
+        *([Setting("params_file", file.params_file, name)] if file.params_file is not None else []),
+        *(
+            Setting(f"{TABLE}.{module}.{node}.{parameter}", value, name)
+            for module, values in file.params.items()
+            for (node, parameter), value in values.items()
+        ),
         *(each for entry, table in file.launch.items() for each in _launch_settings(name, entry, table, contents)),
     ]
 
@@ -198,8 +213,10 @@ def _load(path: Path) -> dict[str, Any]:
 def _parse(path: Path, contents: dict[str, Any]) -> ConfigFile:
     """Return the tables as a ConfigFile. Raises UsageError, which names the file, the table and the key."""
     try:
-        file = _convert({key: value for key, value in contents.items() if key != "launch"}, ConfigFile, "")
+        simple = {key: value for key, value in contents.items() if key not in ("launch", TABLE)}
+        file = _convert(simple, ConfigFile, "")
         file.launch = dict(_entries(contents.get("launch", {})))
+        file.params = read_tables(contents.get(TABLE, {}))
         file.alias = _aliases(file.alias)
         _check_names(file)
     except (ValueError, InvalidName) as error:

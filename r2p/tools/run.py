@@ -11,6 +11,7 @@ import importlib
 import importlib.util
 import inspect
 import logging
+import socket
 import sys
 import traceback
 from collections.abc import Iterable
@@ -22,8 +23,11 @@ import msgspec
 import typer
 
 import r2p
+from r2p.codecs.parameters import Origin
 from r2p.log_lines import internal
-from r2p.names import NODE_MAX, node_name, topic_name
+from r2p.names import NODE_MAX, module_name_from, node_name, topic_name
+from r2p.parameters.sources import ParameterSource, from_options, of_module, read_file
+from r2p.tools.config import Settings
 from r2p.tools.options import Via
 from r2p.tools.session import UsageError, check_urls, service, settings
 
@@ -63,6 +67,17 @@ async def command(
     allow_control: Annotated[
         bool, typer.Option("--allow-control", help="Let other modules change this one by IP links without a key, too.")
     ] = False,
+    params_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Save parameters to this file, and start with what it has.")
+    ] = None,
+    params: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="Start with [params.MODULE.node] of this file (repeatable)."),
+    ] = None,
+    param: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[NODE.]NAME=VALUE", help="Start with this value of a parameter (repeatable)."),
+    ] = None,
     via: Via = None,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended, or Ctrl-C.
@@ -74,12 +89,15 @@ async def command(
     names = chosen.remap | _parse_remap(remap or ())
     programs = load(functions)
     priorities = _parse_priorities(priority or (), programs)
+    name = module or chosen.module or module_name_from(socket.gethostname())
     async with r2p.Module(
-        module or chosen.module,
+        name,
         via=chosen.via,
         remap=names,
         aliases=chosen.aliases,
         allow_control=allow_control,
+        params_file=params_file or chosen.params_file,
+        params=parameter_sources(name, chosen, params or (), param or ()),
     ) as host:
         for program in programs:
             host.start(program.function, name=program.name, priority=priorities.get(program.name, 0), restart=restart)
@@ -87,6 +105,20 @@ async def command(
         links = ", ".join(chosen.via) or "none, local only (--via joins a network)"
         logger.info("module %s runs %s; links: %s; Ctrl-C ends it", host.name, nodes, links)
         await host.wait()
+
+
+def parameter_sources(
+    module: str, chosen: Settings, files: Iterable[Path], options: Iterable[str]
+) -> list[ParameterSource]:
+    """Return where first values of parameters come from; of several files, the last one wins. Raises UsageError."""
+    try:
+        return [
+            of_module(module, chosen.params, Origin.CONFIG, "r2p.toml"),
+            *(read_file(path, module) for path in reversed([*files])),
+            from_options(options),
+        ]
+    except r2p.ParameterError as error:
+        raise UsageError(str(error)) from error
 
 
 def load(targets: Iterable[str]) -> list[Program]:

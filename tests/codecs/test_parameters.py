@@ -82,7 +82,6 @@ def test_bytes_of_strangers_are_refused_or_read(data: bytes, more: st.DataObject
             parameters.decode_changes,
             parameters.decode_part,
             parameters.decode_count,
-            parameters.decode_text,
         ):
             try:
                 decode(each)

@@ -332,7 +332,7 @@ async def test_hostile_requests_set_nothing_and_stop_nothing(seed: int) -> None:
                     chance.randbytes(chance.randrange(PAGE_MAX + 1)),
                     codec.encode_part(chance.choice([0, 1]), chance.choice([0, 1, 1 << 31]), chance.randbytes(20)),
                     codec.encode_part(0, 0, good[: chance.randrange(len(good))]),
-                    codec.encode_text("nobody"),
+                    b"nobody",
                 ]
             )
             header = ServiceHeader(9, number, Kind.REQUEST, a.instance)

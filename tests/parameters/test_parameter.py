@@ -239,3 +239,40 @@ async def test_revisions_tell_what_has_changed() -> None:
         parameters.set({("a", "two"): 2})
         assert [(each.name, each.value) for each in parameters.changed_since(before)] == [("two", 2)]
         assert parameters.declared == before < parameters.revision
+
+
+async def _first(parameter: r2p.Parameter[int]) -> int | None:
+    async for value in parameter.changes():
+        return value
+    return None
+
+
+async def test_a_node_whose_place_another_one_of_its_name_takes_and_gets_it_back() -> None:
+    async with r2p.Module("PC1") as module, node_in(module, name="a") as old:
+        seen: list[int] = []
+        before = old.parameter("level", 0, on_change=seen.append)
+
+        def another() -> r2p.Node:
+            return r2p.Node("a", module.space, parameters=module.parameters)
+
+        new = another()
+        level = new.parameter("level", 1)
+        module.parameters.set({("a", "level"): 5})
+        assert (before.value, level.value) == (0, 5)
+        with pytest.raises(r2p.Closed, match="belongs to a newer node of this name"):
+            before.set(2)
+        new.close()
+        module.parameters.node_gone("a")
+        assert (before.value, seen) == (5, [5])
+        before.set(2)
+        newest = another()
+        assert newest.parameter("level", 1).value == 2  # what was set goes on
+        ended = asyncio.ensure_future(_first(before))
+        await asyncio.sleep(0)
+        old.close()
+        assert await ended is None
+        module.parameters.node_gone("a")
+        module.parameters.set({("a", "level"): 7})
+        newest.close()
+        module.parameters.node_gone("a")
+        assert not module.parameters

@@ -13,7 +13,16 @@ from pathlib import Path
 import pytest
 
 import r2p
-from r2p.tools.config import ConfigFile, LaunchTable, Settings, UsageError, check_owned, list_settings, settings
+from r2p.tools.config import (
+    ConfigFile,
+    LaunchTable,
+    Setting,
+    Settings,
+    UsageError,
+    check_owned,
+    list_settings,
+    settings,
+)
 from r2p.tools.config_show import _as_in_file
 from r2p.tools.run import load_module
 from r2p.tools.session import check_urls
@@ -169,7 +178,7 @@ def test_each_setting_has_a_source(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 def test_the_page_describes_each_key() -> None:
     page = (Path(r2p.__file__).parents[1] / "docs" / "config.md").read_text()
     general, _, launch = page.partition("## [launch.NAME]")
-    assert set(re.findall(r"^\| `\[?([a-z]+)", general, re.MULTILINE)) == set(ConfigFile.__struct_fields__)
+    assert set(re.findall(r"^\| `\[?([a-z_]+)", general, re.MULTILINE)) == set(ConfigFile.__struct_fields__)
     assert set(re.findall(r"^\| `([a-z_]+)`", launch, re.MULTILINE)) == set(LaunchTable.__struct_fields__)
 
 
@@ -230,5 +239,24 @@ def test_the_file_itself_is_looked_at(tmp_path: Path) -> None:
 
 
 def test_values_are_shown_as_in_the_file() -> None:
-    shown = map(_as_in_file, (True, 30.0, ["port 2350", "node WHEELS/drive"], ["gateway"], "started", None))
-    assert list(shown) == ["true", "30s", '"port 2350", "node WHEELS/drive"', ["gateway"], "started", None]
+    values = (True, 30.0, ["port 2350", "node WHEELS/drive"], ["gateway"], "started", None)
+    shown = [_as_in_file(Setting("launch.a.b", each, "r2p.toml")) for each in values]
+    assert shown == ["true", "30s", '"port 2350", "node WHEELS/drive"', ["gateway"], "started", None]
+    assert _as_in_file(Setting("params.PC1.speed.kp", 0.5, "r2p.toml")) == "0.5"
+
+
+def test_first_values_of_parameters(tmp_path: Path) -> None:
+    (tmp_path / "r2p.toml").write_text('params_file = "p.toml"\n[params.PC1.speed]\nkp = 0.5\nlimits.left = [1, 2]')
+    found = settings()
+    assert found.params_file == tmp_path / "p.toml"
+    assert found.params == {"PC1": {("speed", "kp"): 0.5, ("speed", "limits.left"): [1, 2]}}
+    listed = [(each.key, each.value) for each in list_settings() if each.key.startswith("params")]
+    assert listed == [
+        ("params_file", "p.toml"),
+        ("params.PC1.speed.kp", 0.5),
+        ("params.PC1.speed.limits.left", [1, 2]),
+    ]
+    for text, reason in (("params = 3", "write a table"), ('[params."a b".c]', "module name 'a b'")):
+        (tmp_path / "r2p.toml").write_text(text)
+        with pytest.raises(UsageError, match=f"r2p.toml: .*{reason}"):
+            settings()

@@ -5,19 +5,21 @@ from __future__ import annotations
 import re
 import signal
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 import r2p
-from r2p.tools.run import load
+from r2p.testing.network import node_in
+from r2p.tools.config import settings
+from r2p.tools.run import load, parameter_sources
 from r2p.tools.session import UsageError
 from r2p.tools.types import load_type
 from tests.tools.rig import listening, process
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 NODES = """
 import asyncio, time
@@ -302,3 +304,78 @@ def test_a_file_that_does_not_load_is_exit_code_1(tmp_path: Path) -> None:
     assert code == 1
     assert err.startswith("r2p: can't load broken.py:\nTraceback (most recent call last):\n  File")
     assert err.endswith("ZeroDivisionError: division by zero\n")
+
+
+GAINS = """
+import r2p
+
+async def speed(node: r2p.Node) -> None:
+    kp, ki = node.parameter("kp", 0.5), node.parameter("ki", 1)
+    print(kp.value, ki.value, flush=True)
+
+async def arm(node: r2p.Node) -> None:
+    node.parameter("kp", 1)
+"""
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(
+    ("strongest", "value", "origin"),
+    [
+        ("code", 0.5, "code"),
+        ("saved", 1.0, "saved file"),
+        ("config", 2.0, "r2p.toml"),
+        ("file", 4.0, "--params"),
+        ("option", 5.0, "--param"),
+        ("node option", 6.0, "--param"),
+    ],
+)
+async def test_where_the_first_value_of_a_parameter_comes_from(
+    tmp_path: Path, strongest: str, value: float, origin: str
+) -> None:
+    """Each source wins over all that are weaker, which are there as well."""
+    sources = ["code", "saved", "config", "file", "option", "node option"]
+    there = sources[: sources.index(strongest) + 1]
+    (tmp_path / "saved.toml").write_text("format = 1\n" + "[params.PC1.speed]\nkp = 1\n" * ("saved" in there))
+    table = "[params.PC1.speed]\nkp = 2\n[params.PC2.speed]\nkp = 9\n" * ("config" in there)
+    (tmp_path / "r2p.toml").write_text(f'params_file = "saved.toml"\n{table}')
+    files = [tmp_path / "one.toml", tmp_path / "two.toml"] if "file" in there else []
+    for number, path in enumerate(files):
+        path.write_text(f"[params.PC1.speed]\nkp = {number + 3}\n")
+    options = ["kp=5"] * ("option" in there) + ["speed.kp=6.0"] * ("node option" in there)
+    chosen = settings()
+    module = r2p.Module("PC1", params_file=chosen.params_file, params=parameter_sources("PC1", chosen, files, options))
+    async with module, node_in(module, name="speed") as node:
+        kp = node.parameter("kp", 0.5)
+        assert (kp.value, kp.origin) == (value, origin)
+
+
+@pytest.mark.parametrize(
+    ("files", "options", "reason"),
+    [
+        (["none.toml"], [], "there is no file none.toml"),
+        (["nodes.py"], [], "nodes.py: "),
+        (["empty.toml"], [], r"empty.toml has no parameters: write a table \[params.MODULE.node\]"),
+        ([], ["kp"], "--param kp: write it as NAME=VALUE or NODE.NAME=VALUE"),
+        ([], ["a b=1"], "--param a b=1: write it as NAME=VALUE"),
+        ([], [".kp=1"], "--param .kp=1: write it as NAME=VALUE"),
+    ],
+)
+def test_options_of_parameters_that_mean_nothing(
+    tmp_path: Path, files: list[str], options: list[str], reason: str
+) -> None:
+    (tmp_path / "empty.toml").touch()
+    with pytest.raises(UsageError, match=reason):
+        parameter_sources("PC1", settings(), map(Path, files), options)
+
+
+@pytest.mark.processes
+def test_options_reach_the_nodes_and_a_value_that_does_not_fit_is_an_error_of_its_node(tmp_path: Path) -> None:
+    (tmp_path / "gains.py").write_text(GAINS)
+    (tmp_path / "tuned.toml").write_text("[params.PC1.speed]\nki = 3")
+    code, out, err = run(
+        *("gains.py:speed", "gains.py:arm", "--module", "PC1", "--params", "tuned.toml"),
+        *("--param", "speed.kp=7", "--param", "arm.kp=fast", "--params-file", "saved.toml"),
+    )
+    assert (code, out) == (1, "7.0 3\n")
+    assert "PC1/arm.kp = 'fast': it takes an int (from --param)" in err
