@@ -3,6 +3,7 @@
 Each is a type for a parameter of a command, as Typer reads it: `async def echo(session, *, timeout: Timeout = None)`.
 """
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
@@ -68,6 +69,18 @@ def hertz(text: str) -> float:
 Via = Annotated[
     list[str] | None,
     typer.Option("--via", metavar="URL", help="How to join: tcp:HOST:PORT, serial:DEVICE, ... (repeatable)."),
+]
+ParamsFile = Annotated[
+    Path | None,
+    typer.Option("--params-file", metavar="FILE", help="Save parameters to this file, and start with what it has."),
+]
+Params = Annotated[
+    list[Path] | None,
+    typer.Option("--params", metavar="FILE", help="Start with [params.MODULE.node] of this file (repeatable)."),
+]
+Param = Annotated[
+    list[str] | None,
+    typer.Option("--param", metavar="[NODE.]NAME=VALUE", help="Start with this value of a parameter (repeatable)."),
 ]
 Verbose = Annotated[int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Print more.")]
 Quiet = Annotated[int, typer.Option("--quiet", "-q", count=True, show_default=False, help="Print less on stderr.")]

@@ -28,7 +28,7 @@ from r2p.log_lines import internal
 from r2p.names import NODE_MAX, module_name_from, node_name, topic_name
 from r2p.parameters.sources import ParameterSource, from_options, of_module, read_file
 from r2p.tools.config import Settings
-from r2p.tools.options import Via
+from r2p.tools.options import Param, Params, ParamsFile, Via
 from r2p.tools.session import UsageError, check_urls, service, settings
 
 logger = logging.getLogger("r2p.runner")
@@ -67,17 +67,9 @@ async def command(
     allow_control: Annotated[
         bool, typer.Option("--allow-control", help="Let other modules change this one by IP links without a key, too.")
     ] = False,
-    params_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Save parameters to this file, and start with what it has.")
-    ] = None,
-    params: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE", help="Start with [params.MODULE.node] of this file (repeatable)."),
-    ] = None,
-    param: Annotated[
-        list[str] | None,
-        typer.Option(metavar="[NODE.]NAME=VALUE", help="Start with this value of a parameter (repeatable)."),
-    ] = None,
+    params_file: ParamsFile = None,
+    params: Params = None,
+    param: Param = None,
     via: Via = None,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended, or Ctrl-C.
