@@ -1,4 +1,4 @@
-"""`r2p msg`: the message types that this computer knows, and C headers of them for firmware."""
+"""`r2p msg`: the message types that this computer knows, for firmware as C headers, and to and from ROS."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 import r2p
+from r2p.messages import SIZE_MAX
 from r2p.tools.c_header import c_header, header_path, with_nested
 from r2p.tools.completion import complete_type
 from r2p.tools.options import Format
@@ -14,7 +15,9 @@ from r2p.tools.output import Output, notify
 from r2p.tools.session import UsageError, group, settings, standalone
 from r2p.tools.types import Types, class_path, put_sizes, size_text, standard_types, type_name
 
-app = group("Show message types, and export them to C.")
+app = group("Show message types, export them to C and ROS, and import those of ROS.")
+
+_BOUND = 1000  # of texts and arrays of ROS that have none: small enough for most links
 
 _COLUMNS = ["type", "size", "varies", "class"]
 
@@ -63,22 +66,103 @@ async def show(type: TypeArgument, *, format: Format = None) -> None:
 async def export(
     types: TypeArguments = None,
     *,
-    c: Annotated[Path, typer.Option("--c", metavar="DIR", help="Where to write the C headers.", show_default=False)],
+    c: Annotated[
+        Path | None, typer.Option("--c", metavar="DIR", help="Where to write C headers.", show_default=False)
+    ] = None,
+    ros1: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where to write packages for ROS 1.", show_default=False)
+    ] = None,
+    ros2: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where to write packages for ROS 2.", show_default=False)
+    ] = None,
 ) -> None:
-    """Write packed C structs of message types.
+    """Write packed C structs of message types, or packages for ROS.
 
-    Each gets a header, DIR/package/Name.h, in which the compiler checks its size and offsets. Types whose length varies
-    have no struct, as firmware's messages have a fixed size.
+    With --c, each type gets a header, DIR/package/Name.h, in which the compiler checks its size and offsets. Types
+    whose length varies have no struct, as firmware's messages have a fixed size.
+
+    With --ros1 or --ros2, DIR/package is one to put into the src of a workspace. Types of ROS's own packages are left
+    out. Bytes and checks of types are those that r2p uses with ROS.
     """
+    if c is None and ros1 is None and ros2 is None:
+        raise UsageError("where to? give --c DIR for C headers, --ros1 DIR or --ros2 DIR for packages of ROS")
     known = Types(settings())
-    classes = [known.load(text) for text in types or ()] or [cls for cls in _known() if r2p.layout(cls).exact_size]
-    headers = _headers(classes)
+    chosen = [known.load(text) for text in types or ()]
+    if c is not None:
+        _export_c(c, chosen, everything=not types)
+    for version, folder in ((1, ros1), (2, ros2)):
+        if folder is not None:
+            _export_ros(folder, version, chosen or _known())
+
+
+def _export_c(folder: Path, classes: list[type[r2p.Message]], *, everything: bool) -> None:
+    headers = _headers([cls for cls in _known() if r2p.layout(cls).exact_size] if everything else classes)
     for path, text in headers.items():
-        _write(c / path, text)
+        _write(folder / path, text)
     left_out = [type_name(cls) for cls in _known() if r2p.layout(cls).varies]
-    if not types and left_out:
+    if everything and left_out:
         notify(f"left out, as their length varies: {', '.join(left_out)}")
-    notify(f"{len(headers)} headers in {c}: compile with -I {c}")
+    notify(f"{len(headers)} headers in {folder}: compile with -I {folder}")
+
+
+def _export_ros(folder: Path, version: int, classes: list[type[r2p.Message]]) -> None:
+    from r2p.ros.packages import packages  # later: commands that need no ROS start faster
+
+    try:
+        files = packages(classes, version)
+    except r2p.MessageError as error:
+        raise UsageError(str(error)) from error
+    if not files:
+        raise UsageError(f"all of these types are in packages that come with ROS {version}")
+    for path, text in files.items():
+        _write(folder / path, text)
+    written = sorted({path.partition("/")[0] for path in files})
+    build = "catkin_make" if version == 1 else "colcon build"
+    notify(f"{', '.join(written)} in {folder}: put it into the src of a workspace, and run {build}")
+
+
+@app.command("import")
+@standalone
+async def import_(
+    type: Annotated[
+        str,
+        typer.Argument(
+            metavar="TYPE", show_default=False, help="sensor_msgs/Imu, or the path of a .msg, .srv or .action file."
+        ),
+    ],
+    *,
+    ros1: Annotated[bool, typer.Option("--ros1", help="The type as ROS 1 has it; default: ROS 2.")] = False,
+    bound: Annotated[
+        int,
+        typer.Option(
+            "--max",
+            metavar="N",
+            min=1,
+            max=SIZE_MAX,
+            help="Bound of texts (bytes) and arrays (elements) that have none.",
+        ),
+    ] = _BOUND,
+) -> None:
+    """Print a type of ROS as Python classes for r2p, with the bytes of ROS 1.
+
+    Types that r2p.msg has are imported from there. Nested types are looked for beside the package of a file, then among
+    those that come with ROS (pip install 'r2p[ros]').
+    """
+    from r2p.ros.classes import RosTypes
+    from r2p.ros.definitions import short_name
+    from r2p.ros.library import DefinitionFile, definitions_of_ros
+    from r2p.ros.source import source
+
+    version = 1 if ros1 else 2
+    try:
+        if Path(type).suffix in (".msg", ".srv", ".action"):
+            names, definitions = DefinitionFile(Path(type)).read(version)
+        else:
+            names, definitions = [short_name(type)], definitions_of_ros(type, version)
+        types = RosTypes(version, definitions)
+        typer.echo(source([types.load(name) for name in names], definitions, bound), nl=False)
+    except r2p.MessageError as error:
+        raise UsageError(str(error)) from error
 
 
 def _write(path: Path, text: str) -> None:

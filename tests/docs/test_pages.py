@@ -26,7 +26,7 @@ OF_R2P = {"--version", "--help", "-h", "--install-completion", "--show-completio
 _INLINE = re.compile(r"(?<!`)`(r2p [^`]+)`(?!`)")
 _IN_BLOCK = re.compile(r"(?:^|[ /])(r2p [a-z-].*)$", re.MULTILINE)
 _END = re.compile(r"[|;&<>)]| 2>")
-_OPTION = re.compile(r"(?<!\S)--?[a-z][a-z-]*")
+_OPTION = re.compile(r"(?<!\S)--?[a-z][a-z0-9-]*")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 
 

@@ -31,7 +31,7 @@ def test_every_option_of_every_command_is_told(heading: str, command: Any) -> No
     sections = re.split(r"^## ", COMMAND.read_text(), flags=re.MULTILINE)
     own = [section for section in sections if section.startswith(f"{heading}\n")]
     assert own, f"no section {heading}"
-    told = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", own[0] + sections[1]))
+    told = set(re.findall(r"(?<![\w-])--?[a-z][a-z0-9-]*", own[0] + sections[1]))
     options = {name for each in command.params for name in each.opts if name.startswith("-")}
     assert options <= told | {"--help", "-h"}
 

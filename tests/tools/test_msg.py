@@ -116,6 +116,11 @@ def test_what_is_exported_by_default_and_what_is_not(tmp_path: Path) -> None:
         (["export", "Empty", "--c", "d"], 2, "std_msgs/Empty has no struct: it has no bytes"),
         (["export", "Led", f"{__name__}:Led2", "--c", "d"], 2, "two different types are named r2p_msgs/Led: give one"),
         (["export", "Led", "--c", "r2p.toml"], 1, "can't write r2p.toml/r2p_msgs/Led.h: Not a directory"),
+        (["export", "Led"], 2, "where to? give --c DIR for C headers, --ros1 DIR or --ros2 DIR for packages of ROS"),
+        (["export", "LaserScan", "--ros2", "d"], 2, "all of these types are in packages that come with ROS 2"),
+        (["export", f"{__name__}:Led2", "Led", "--ros1", "d"], 2, "two different types are named r2p_msgs/Led"),
+        (["import", "LaserScan"], 2, "'LaserScan' is not the name of a ROS type, such as sensor_msgs/Imu"),
+        (["import", "nothing/Nothing.msg"], 2, "can't read"),
         (["show", "sensor_msgs/Scan"], 2, "has a type sensor_msgs/Scan; did you mean sensor_msgs/LaserScan?"),
     ],
 )

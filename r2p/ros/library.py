@@ -1,0 +1,101 @@
+"""The definitions that come with ROS, which rosbags has (extra `ros`), and those in folders of packages.
+
+definitions_of_ros("sensor_msgs/Imu", 2)     of ROS 1 (Noetic) or ROS 2 (the latest one that rosbags knows)
+DefinitionFile(path).read(2)                 of a .msg, .srv or .action file, and of what it needs
+"""
+
+import difflib
+import functools
+import re
+from pathlib import Path
+from typing import Any
+
+from r2p.errors import MessageError
+from r2p.ros.definitions import MessageDefinition, parse, parse_action, parse_service, short_name
+
+_PARTS = {".srv": parse_service, ".action": parse_action}
+_FIRST_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
+
+
+def definitions_of_ros(name: str, version: int) -> dict[str, MessageDefinition]:
+    """Return the definition of a type that comes with ROS 1 or 2 (`version`), and then those of all types in it.
+
+    Raises MessageError, which says what to do, if it has no such type, or rosbags is missing.
+    """
+    name = short_name(name)
+    store = _store(version)
+    full = name.replace("/", "/msg/")
+    if full not in store.types:
+        known = [each.replace("/msg/", "/") for each in store.types]
+        close = difflib.get_close_matches(name, known, n=1)
+        advice = f"did you mean {close[0]}?" if close else "give the path of its .msg file"
+        raise MessageError(f"ROS {version} comes without a type {name}; {advice}")
+    text, _ = store.generate_msgdef(full, ros_version=version)
+    return parse(name, text)
+
+
+@functools.cache
+def _store(version: int) -> Any:
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise MessageError("the definitions of ROS are in rosbags: pip install 'r2p[ros]'") from error
+    return get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.LATEST)
+
+
+class DefinitionFile:
+    """A .msg, .srv or .action file, and the package that it is in: `PACKAGE/msg/Name.msg`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path.resolve()
+        folder = self._path.parent
+        self._package = folder.parent if folder.name in ("msg", "srv", "action") else folder
+        if not _FIRST_NAME.fullmatch(path.stem):
+            raise MessageError(f"{path}: the file of a ROS type has its name, such as Imu.msg")
+
+    def read(self, version: int) -> tuple[list[str], dict[str, MessageDefinition]]:
+        """Return the names of the types in the file, one or the parts of a service or action, and all definitions.
+
+        Nested types are looked for in the file's package, in packages beside it, then in ROS 1 or 2 (`version`).
+        Raises MessageError for a file that can't be read, or a type that is nowhere.
+        """
+        suffix = self._path.suffix
+        kind = suffix.removeprefix(".")
+        name = f"{self._package.name}/{kind}/{self._path.stem}" if version > 1 else self._name(self._path.stem)
+        text = _read(self._path)
+        if suffix in _PARTS:
+            parts = {each.name: each for each in _PARTS[suffix](name, text)}
+        elif suffix == ".msg":
+            parts = parse(self._name(self._path.stem), text)
+        else:
+            raise MessageError(f"{self._path.name} is not a .msg, .srv or .action file")
+        names = list(parts) if suffix in _PARTS else list(parts)[:1]
+        found = dict(parts)
+        for definition in parts.values():
+            self._add_nested(definition, version, found)
+        return names, found
+
+    def _name(self, last: str) -> str:
+        return short_name(f"{self._package.name}/{last}")
+
+    def _add_nested(self, definition: MessageDefinition, version: int, found: dict[str, MessageDefinition]) -> None:
+        for name in definition.nested:
+            if name in found:
+                continue
+            package, _, last = name.partition("/")
+            file = self._package.parent / package / "msg" / f"{last}.msg"
+            if file.is_file():
+                found |= parse(name, _read(file))
+                self._add_nested(found[name], version, found)
+            else:
+                try:
+                    found |= definitions_of_ros(name, version) | found
+                except MessageError as error:
+                    raise MessageError(f"{definition.name} needs {name}, but there is no {file}: {error}") from None
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise MessageError(f"can't read {path}: {getattr(error, 'strerror', None) or error}") from None
