@@ -23,6 +23,7 @@ right before a block are notes, `<!-- key -->` or `<!-- key: value -->`:
 | `keeps running` | console: the last command goes on to the end of the page |
 | `exits: 3` | console: the exit code of its commands, else 0 |
 | `not run: why` | console: shown, but not run |
+| `compiled` | c: compiled together with the others of the page, and called |
 
 A block that consists of `--8<-- "FILE"` shows a file, which has tests of its own, and is not seen here.
 
@@ -39,7 +40,7 @@ import msgspec
 
 ROOT = Path(__file__).parents[2]
 LANGUAGES = {"python", "console", "toml", "json5", "text", "c", "ini"}
-NOTES = {"continues", "output", "pytest", "frames", "recorded", "keeps running", "exits", "not run"}
+NOTES = {"continues", "output", "pytest", "frames", "recorded", "keeps running", "exits", "not run", "compiled"}
 
 _FENCE = re.compile(
     r"^(?P<indent> *)```(?P<info>[^`\n]*)\n(?P<text>.*?)^(?P=indent)```$",
