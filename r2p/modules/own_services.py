@@ -51,7 +51,7 @@ _REMEMBERED = 10 * SECOND  # ns for which an answer is remembered
 _CHANGE_REMEMBERED = 60 * SECOND  # ... and that of a change: nothing on the way holds a request back for so long
 _RUNNING_MAX = 64  # handlers that run at once
 _REFUSALS = (Error, LookupError, ValueError)  # what a handler raises for its caller
-_REFUSALS_APART = 60 * SECOND  # ns between two lines of the log about changes that one link lacks the permission for
+_REFUSALS_APART = 60 * SECOND  # ns between two lines of the log about changes from links of one scheme
 _CONTENTS_MAX = 64  # contents of several pages that are kept: the latest of each caller and argument
 
 
@@ -305,7 +305,9 @@ class OwnServices:
 
     def _remembered(self, call: OwnCall) -> tuple[RememberedAnswers, int]:
         """Return the memory for the answer to a request, and for how long it stays there (ns)."""
-        return (self._changes, _CHANGE_REMEMBERED) if call.changes else (self._answers, _REMEMBERED)
+        if call.changes and not call.page:  # its other pages change nothing
+            return self._changes, _CHANGE_REMEMBERED
+        return self._answers, _REMEMBERED
 
     def _make_answer(self, link: Link, call: OwnCall, source: Hashable) -> bytes | None:
         """Return the answer to a request; None if a task makes it."""
@@ -333,7 +335,9 @@ class OwnServices:
         except asyncio.CancelledError:
             if self.tasks is None:
                 raise  # the module ends
-            answer = self._error(running.link, call, ServiceError("it was cancelled there"))  # or it would run again
+            answer = self._error(
+                running.link, call, ServiceError("the module has cancelled it")
+            )  # or it would run again
         except Exception as error:  # noqa: BLE001 - the caller learns of it
             answer = self._error(running.link, call, error)
         finally:
@@ -364,7 +368,7 @@ class OwnServices:
     def _refuse(self, link: Link, call: OwnCall, refusal: str) -> bytes:
         """Count a request that lacks permission, log it once in a while, and return its answer."""
         link.stats.lost["change refused"] += 1
-        suffix = self._refusals.suffix(link.name, self._clock.monotonic())
+        suffix = self._refusals.suffix(scheme_of(link.name), self._clock.monotonic())  # clients come by the thousand
         if suffix is not None:
             logger.warning("link %s: %s%s", link.title, refusal, suffix)
         return own_services.refusal(call, refusal)

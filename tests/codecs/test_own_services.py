@@ -36,6 +36,24 @@ def test_a_request_goes_to_the_server_and_the_rest_to_the_caller() -> None:
     assert (answer.target, own_services.topic_of(own_services.encode(answer))) == (1, b"R2P_REPLY")
 
 
+@given(CALLS, st.text(max_size=300))
+def test_a_refusal_is_an_error_in_the_place_of_the_module(call: OwnCall, text: str) -> None:
+    answer = own_services.decode(own_services.refusal(call, text))
+    assert answer.header == ServiceHeader(call.header.instance, call.header.number, Kind.ERROR, call.header.server)
+    assert (answer.operation, answer.page) == (call.operation, call.page)
+    assert len(answer.body) <= PAGE_MAX
+
+
+@given(st.binary(max_size=2 * MESSAGE_MAX) | CALLS.map(own_services.encode))
+def test_whatever_may_change_something_needs_a_seal(data: bytes) -> None:
+    try:
+        call = own_services.decode(data)
+    except DecodeError:
+        own_services.is_change(data)
+    else:
+        assert own_services.is_change(data) == (call.changes and call.is_request)
+
+
 def test_a_message_that_does_not_fit() -> None:
     with pytest.raises(MessageError, match="carries 180 bytes, not 181"):
         own_services.encode(OwnCall(QUESTION.header, 1, body=bytes(181)))

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from typer.testing import CliRunner
 
 import r2p
 from r2p.testing.network import node_in
 from r2p.tools.config import settings
+from r2p.tools.main import app
 from r2p.tools.run import load, parameter_sources
 from r2p.tools.session import UsageError
 from r2p.tools.types import load_type
@@ -163,6 +165,19 @@ def test_errors_in_the_file_come_with_its_lines_and_none_of_ours(
     files = [line for line in lines if line.strip().startswith("File ")]
     assert files
     assert all(str(file) in line for line in files)
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_changes_by_ip_links_are_let_in_only_if_the_user_says_so(
+    allowed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, allow_control: bool, **__: object) -> None:
+        raise r2p.Error(f"control: {allow_control}")
+
+    (tmp_path / "nodes.py").write_text(NODES, encoding="ascii")
+    monkeypatch.setattr(r2p, "Module", refuse)
+    result = CliRunner().invoke(app, ["run", "nodes.py:once", *(["--allow-control"] if allowed else [])])
+    assert f"control: {allowed}" in result.output
 
 
 GUARD = 'runs as soon as the file is loaded: put it under `if __name__ == "__main__":`'
