@@ -48,22 +48,22 @@ async def find(settings: Settings, source: Source) -> list[str]:
 
 def complete_topic(ctx: typer.Context, incomplete: str) -> list[str]:
     """Completions for a topic: those that r2p.toml names, and those of the network."""
-    return _beginning(incomplete, [*_stated(incomplete), *_on_network(ctx, topics)])
+    return beginning(incomplete, [*_stated(incomplete), *on_network(ctx, topics)])
 
 
 def complete_service(ctx: typer.Context, incomplete: str) -> list[str]:
     """Completions for a service."""
-    return _beginning(incomplete, _on_network(ctx, services))
+    return beginning(incomplete, on_network(ctx, services))
 
 
 def complete_module(ctx: typer.Context, incomplete: str) -> list[str]:
     """Completions for a module."""
-    return _beginning(incomplete, _on_network(ctx, modules))
+    return beginning(incomplete, on_network(ctx, modules))
 
 
 def complete_node(ctx: typer.Context, incomplete: str) -> list[str]:
     """Completions for a node: MODULE/NODE, or NODE where that is what the user has begun."""
-    return _node_beginning(incomplete, _on_network(ctx, nodes))
+    return _node_beginning(incomplete, on_network(ctx, nodes))
 
 
 def complete_node_or_module(ctx: typer.Context, incomplete: str) -> list[str]:
@@ -72,7 +72,7 @@ def complete_node_or_module(ctx: typer.Context, incomplete: str) -> list[str]:
     async def both(session: Session) -> list[str]:
         return [*await modules(session), *await nodes(session)]
 
-    return _node_beginning(incomplete, _on_network(ctx, both))
+    return _node_beginning(incomplete, on_network(ctx, both))
 
 
 def complete_awaited(ctx: typer.Context, incomplete: str) -> list[str]:
@@ -86,7 +86,7 @@ def complete_entry(ctx: typer.Context, incomplete: str) -> list[str]:
     """Completions for an entry of the file of `r2p launch`."""
     with _silence():
         path = ctx.params.get("file") or find_config()
-        return _beginning(incomplete, read_config(path).launch if path else ())
+        return beginning(incomplete, read_config(path).launch if path else ())
     return []
 
 
@@ -94,11 +94,11 @@ def complete_type(incomplete: str) -> list[str]:
     """Completions for a type: bare and full names, and the names in r2p.msg behind its name and a colon."""
     classes = standard_types()
     if ":" in incomplete:
-        return _beginning(incomplete, [f"{STANDARD}:{cls.__name__}" for cls in classes])
+        return beginning(incomplete, [f"{STANDARD}:{cls.__name__}" for cls in classes])
     with _silence():
         classes += Types(settings()).named
     bare = [cls.__name__ for cls in standard_types()]
-    return _beginning(incomplete, bare + [type_name(cls) for cls in classes])
+    return beginning(incomplete, bare + [type_name(cls) for cls in classes])
 
 
 # What a network has
@@ -128,7 +128,7 @@ async def nodes(session: Session) -> list[str]:
     return [f"{module}/{node}" for module, node in session.module.network.nodes() if not module.startswith("_")]
 
 
-def _on_network(ctx: typer.Context, source: Source) -> list[str]:
+def on_network(ctx: typer.Context, source: Source) -> list[str]:
     """Return what there is on the network of the command line, R2P_VIA or r2p.toml; nothing if there is none."""
     with _silence():
         chosen = settings(list(ctx.params.get("via") or ()), tool=True)
@@ -159,14 +159,14 @@ def _silence() -> Iterator[None]:
 # What the shell gets
 
 
-def _beginning(incomplete: str, names: Iterable[str]) -> list[str]:
+def beginning(incomplete: str, names: Iterable[str]) -> list[str]:
     """Return the names that begin like this, each once."""
     return list(dict.fromkeys(name for name in names if name.startswith(incomplete)))
 
 
 def _node_beginning(incomplete: str, paths: list[str]) -> list[str]:
     """Return the paths that begin like this, else the bare names of nodes that do."""
-    return _beginning(incomplete, paths) or _beginning(incomplete, [path.rpartition("/")[2] for path in paths])
+    return beginning(incomplete, paths) or beginning(incomplete, [path.rpartition("/")[2] for path in paths])
 
 
 def answer(complete: Callable[[], object]) -> None:

@@ -148,7 +148,7 @@ class _Printer:
             "text": record.text,
         }
         where = "/".join(part for part in (module or "?", record.node) if part)
-        text = f"{_clock_text(stamp)} {level.name:<8} {where}: {record.text}"
+        text = f"{clock_text(stamp)} {level.name:<8} {where}: {record.text}"
         await self._output.put(values, text, colour=_COLOURS.get(level), wrap=True)
 
 
@@ -166,7 +166,7 @@ def _level_of(number: int) -> Level:
     return next((each for each in reversed(Level) if number >= each.number), Level.DEBUG)
 
 
-def _clock_text(stamp: int) -> str:
+def clock_text(stamp: int) -> str:
     """Return an instant (ns) as the time of day here."""
     record = logging.makeLogRecord({"created": stamp / SECOND})
     return f"{_CLOCK.formatTime(record, '%H:%M:%S')}.{stamp // MILLISECOND % 1000:03}"

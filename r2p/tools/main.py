@@ -23,6 +23,7 @@ GROUPS = {
     "topic": ("r2p.tools.topic", "List, watch, publish and measure topics."),
     "service": ("r2p.tools.service", "List, inspect and call services."),
     "node": ("r2p.tools.node", "List and inspect nodes."),
+    "param": ("r2p.tools.param", "List, get, set and save parameters of nodes."),
     "module": ("r2p.tools.module", "List, stop and restart modules."),
     "msg": ("r2p.tools.msg", "Show message types, and export them to C."),
     "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots."),

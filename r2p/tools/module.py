@@ -76,7 +76,7 @@ async def info(session: Session, module: Name, *, wait: Wait = None, format: For
     await session.settle(wait, of="modules")
     view = _find(session, module)
     if view is None:
-        raise r2p.Error(_unknown_text(session, module))
+        raise r2p.Error(unknown_module(session, module))
     module = view.name
     record = _row(view, for_people=output.format == "text")
     if view.instance is None:
@@ -189,7 +189,7 @@ class _CommandSender:
         await wait_until(lambda: bool(self._flags) or self._is_unknown(), _FIRST_STATE)
         while True:
             if self._is_unknown():
-                raise r2p.Error(_unknown_text(self._session, self.name))
+                raise r2p.Error(unknown_module(self._session, self.name))
             self._check_has_loader()
             if not self._flags:
                 self._session.module.query()  # again: a gateway may not have heard the first one
@@ -267,7 +267,7 @@ def _find(session: Session, name: str) -> r2p.ModuleView | None:
     return min(views, key=lambda view: view.age, default=None)
 
 
-def _unknown_text(session: Session, name: str) -> str:
+def unknown_module(session: Session, name: str) -> str:
     found = sorted({view.name for view in session.module.network.modules() if view.link and view.state != "observer"})
     close = [each for each in found if each.rpartition("/")[2] == name]  # one of each robot: none is likelier
     close = close or difflib.get_close_matches(name, found, cutoff=0.5)
@@ -278,7 +278,7 @@ def _unknown_text(session: Session, name: str) -> str:
 def _timeout_text(session: Session, command: r2p.Command, name: str, timeout: float) -> str:
     view = _find(session, name)
     if view is None:
-        return f"{_unknown_text(session, name)}; gave up after {timeout:g} s"
+        return f"{unknown_module(session, name)}; gave up after {timeout:g} s"
     text = f"{name} did not confirm {command.name} in {timeout:g} s: it is {view.state}, last seen {view.age:.1f} s ago"
     if command is r2p.Command.REBOOT and view.rebooted:
         text += "; it had been rebooted before, so its ALIVE may not show it"

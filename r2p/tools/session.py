@@ -367,14 +367,17 @@ def command(
     opening: Opening | None = None,
     endless: Endless = counts_without_end,
     check: Check | None = None,
+    takes_numbers: bool = False,
 ) -> Callable[[B], B]:
     """Make a command of `app` from the coroutine function that this decorates, and return the function unchanged.
 
-    The function takes a Session first, or what `opening` opens, then its own arguments and options.
+    The function takes a Session first, or what `opening` opens, then its own arguments and options. If it
+    `takes_numbers`, unknown options such as -0.5 are arguments, which it has to check.
     """
+    context = {"ignore_unknown_options": True} if takes_numbers else None
 
     def register(body: B) -> B:
-        app.command(name)(joined(body, opening=opening, endless=endless, check=check))
+        app.command(name, context_settings=context)(joined(body, opening=opening, endless=endless, check=check))
         return body
 
     return register

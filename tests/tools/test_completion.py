@@ -94,6 +94,8 @@ def test_a_link_that_can_not_come_up_is_silent(url: str, monkeypatch: pytest.Mon
 
 
 async def drive(node: r2p.Node) -> None:
+    node.parameter("kp", 0.5)
+    node.parameter("reverse", False)
     node.advertise("encoder", Encoder)
     node.serve("add", Add.Request, Add.Response, add)
     node.subscribe("leds", Led)
@@ -203,6 +205,19 @@ def url() -> Iterator[str]:
         loop.call_soon_threadsafe(ended.set)
         thread.join()
         loop.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("get BO", ["BOT", "BOT/drive"]),
+        ("info BOT/drive k", ["kp"]),
+        ("set BOT/drive reverse=", ["reverse=false", "reverse=true"]),
+    ],
+)
+def test_parameters_are_completed(words: str, found: list[str], url: str) -> None:
+    verb, *rest = words.split(" ")
+    assert completions(f"r2p param {verb} --via {url} {' '.join(rest)}") == found
 
 
 @pytest.mark.processes

@@ -1,0 +1,158 @@
+"""`r2p param list`, `get`, `info`, `dump` and `watch`: commands that change nothing."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import r2p
+from r2p.tools.log import clock_text
+from r2p.tools.options import Count, Format, Once, Timeout, Wait
+from r2p.tools.output import Output, notify
+from r2p.tools.param.arguments import MaybeTarget, Names, Target
+from r2p.tools.param.targets import find, find_modules, meant
+from r2p.tools.param.texts import COLUMNS, FIELDS, details, dumped, plain, record, row, shown, with_unit
+from r2p.tools.session import Session, patience
+
+_AGAIN = 2.0  # seconds until a module that did not answer is asked again
+
+
+async def list_(
+    session: Session,
+    target: MaybeTarget = None,
+    *,
+    wait: Wait = None,
+    format: Format = None,
+) -> None:
+    """List parameters: of all modules, of one, or of a node."""
+    output = Output(format)
+    infos = await find(session, target, wait=wait)
+    if output.format == "text":
+        await output.table([row(info) for info in infos], COLUMNS)
+    else:
+        await output.table([record(info) for info in infos], FIELDS)
+    if not infos:
+        session.report_none("parameters")
+
+
+async def get(
+    session: Session,
+    target: Target,
+    names: Names = None,
+    *,
+    format: Format = None,
+) -> None:
+    """Print the values of parameters: of a node, or those that are named."""
+    output = Output(format)
+    for info in await find(session, target, names or []):
+        brief = {"module": info.module, "node": info.node, "name": info.name, "value": plain(info.value)}
+        await output.put(brief | {"unit": info.unit}, f"{info.full_name} = {with_unit(info, info.value)}")
+
+
+async def info(session: Session, target: Target, names: Names = None, *, format: Format = None) -> None:
+    """Show everything about parameters.
+
+    Value and origin (code, saved file, r2p.toml, --params, --param, run time), what is saved, default, range, unit, and
+    what it is for.
+    """
+    output = Output(format)
+    for each in await find(session, target, names or []):
+        await output.put(record(each), details(each), wrap=True)
+
+
+async def dump(session: Session, target: MaybeTarget = None) -> None:
+    """Print parameters as a TOML file, which `r2p param load` and `r2p run --params` read."""
+    infos = await find(session, target)
+    if not infos:
+        raise r2p.Error(session.none_yet("parameters"))
+    output = Output()
+    output.format = "text"  # in a pipe, too: it is for a file
+    await output.put({}, dumped(infos).rstrip("\n"))
+
+
+async def watch(
+    session: Session,
+    target: MaybeTarget = None,
+    names: Names = None,
+    *,
+    count: Count = None,
+    once: Once = False,
+    timeout: Timeout = None,
+    format: Format = None,
+) -> None:
+    """Print each change of parameters, until Ctrl-C: of all modules, one, or a node.
+
+    A module that does not answer is asked again: watching goes on when it is back.
+    """
+    output = Output(format)
+    infos = await find(session, target, names or [])
+    modules = list(dict.fromkeys(each.module for each in infos)) or await find_modules(session, target)
+    if not modules:
+        raise r2p.Error(session.none_yet("modules with parameters"))
+    watched = f"{len(infos)} parameter{'' if len(infos) == 1 else 's'} of {', '.join(modules)}"
+    notify(f"watching {watched}; Ctrl-C ends it")
+    async with output.while_read(), patience(f"no change of {watched}", timeout) as received:
+        printer = _ChangePrinter(output, target, names or [], infos, received)
+        await printer.run(session, modules, 1 if once else count)
+
+
+class _ChangePrinter:
+    """Prints the changes of parameters that a reference means."""
+
+    def __init__(
+        self,
+        output: Output,
+        target: str | None,
+        names: list[str],
+        infos: list[r2p.ParameterInfo],
+        received: Callable[[], None],
+    ) -> None:
+        self._output = output
+        self._target = target
+        self._names = names
+        self._received = received
+        self._values = {each.full_name: each.value for each in infos}
+        self._last = asyncio.Event()
+        self._left: int | None = None
+
+    async def run(self, session: Session, modules: list[str], count: int | None) -> None:
+        """Print `count` changes (None: until cancelled)."""
+        self._left = count
+        async with asyncio.TaskGroup() as tasks:
+            watching = [tasks.create_task(self._watch(session, module)) for module in modules]
+            await self._last.wait()
+            for task in watching:
+                task.cancel()
+
+    async def _watch(self, session: Session, module: str) -> None:
+        """Print the changes of one module, whatever it does meanwhile."""
+        while True:
+            try:
+                async for change in session.module.network.watch_parameters(module):
+                    await self._print(session, change)
+            except (r2p.Error, TimeoutError) as error:
+                notify(f"{error}; trying again")
+            await asyncio.sleep(_AGAIN)
+            session.module.query()
+
+    async def _print(self, session: Session, info: r2p.ParameterInfo) -> None:
+        if self._left == 0 or not self._is_meant(info):
+            return
+        before = self._values.get(info.full_name)
+        if before == info.value:  # it was saved, or has another origin
+            return
+        self._values[info.full_name] = info.value
+        self._received()
+        stamp = session.node.now()
+        was = "new" if before is None else f"was {shown(info, before)}"
+        text = f"{clock_text(stamp)} {info.full_name} = {with_unit(info, info.value)} ({was}; {info.origin})"
+        changed: dict[str, Any] = {"stamp": stamp, "module": info.module, "node": info.node, "name": info.name}
+        changed |= {"value": plain(info.value), "before": plain(before), "unit": info.unit, "origin": info.origin}
+        await self._output.put(changed, text)
+        if self._left is not None:
+            self._left -= 1
+            if not self._left:
+                self._last.set()
+
+    def _is_meant(self, info: r2p.ParameterInfo) -> bool:
+        in_target = self._target is None or bool(meant([info], self._target))
+        return in_target and (not self._names or info.name in self._names)

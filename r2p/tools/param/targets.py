@@ -1,0 +1,166 @@
+"""Which parameters a command is about: it takes a reference, and asks the modules that the reference may mean.
+
+| reference | means |
+| --- | --- |
+| `MODULE` | all parameters of a module |
+| `MODULE/NODE`, or `NODE` | those of a node |
+| `MODULE/NODE.NAME`, `NODE.NAME`, or `MODULE/NODE/NAME` | one |
+
+Names behind a reference choose some of its parameters.
+"""
+
+import asyncio
+import difflib
+from collections.abc import Iterable
+
+import r2p
+from r2p.tools.module import unknown_module
+from r2p.tools.output import notify
+from r2p.tools.session import Session, TimedOut, UsageError, wait_until
+
+_FOUND_WITHIN = 8.0  # seconds in which a module has been announced, through gateways as well
+_LEVELS = 6  # kinds of references
+_AT_ONCE = 8  # modules that are asked at the same time
+_SHOWN = 8  # names in an error
+
+Infos = list[r2p.ParameterInfo]
+
+
+async def find(session: Session, target: str | None, names: Iterable[str] = (), wait: float | None = None) -> Infos:
+    """Return the parameters that a reference means (None: all of the network), and of those the ones of these names.
+
+    Raises TimedOut if there is no such module or it does not answer, and r2p.Error if it has no such parameter. Of all
+    modules, those that can't answer are only reported.
+    """
+    modules = await find_modules(session, target, wait)
+    infos = await _ask(session, modules, may_fail=target is None or len(modules) > 1)
+    infos.sort(key=lambda info: (info.module, info.node))  # what a node declares stays in its order
+    if target is None:
+        return infos
+    found = meant(infos, target)
+    if not found:
+        raise _unknown(session, target, modules, infos)
+    return _named(found, list(names), target)
+
+
+async def find_modules(session: Session, target: str | None, wait: float | None = None) -> list[str]:
+    """Return the r2p modules that a reference may mean; of a node alone, all. Raises TimedOut if there is none."""
+    if not session.settings.via:
+        raise UsageError("no network to look for parameters on: give --via tcp:HOST:PORT or set R2P_VIA")
+    await session.settle(wait=wait or 0)
+    if wait is None:
+        session.module.query()
+        settled = asyncio.create_task(session.settled())
+        try:
+            await wait_until(lambda: settled.done() or bool(_prefix(session, target)), _FOUND_WITHIN)
+        finally:
+            settled.cancel()
+    names = _prefix(session, target)
+    known = {view.name: view for view in session.module.network.modules() if view.link and view.state != "observer"}
+    if names and all(known[name].instance is None for name in names):
+        raise r2p.Error(f"{names[0]} is firmware: it has no parameters that others can ask for")
+    if not names and target is not None and "/" in target:
+        raise TimedOut(unknown_module(session, target.partition("/")[0]))
+    return names or sorted(name for name, view in known.items() if view.instance is not None)
+
+
+def meant(infos: Infos, target: str) -> Infos:
+    """Return those of the parameters that a reference means."""
+    spelt = [references(info.module, info.node, info.name) for info in infos]
+    for level in range(_LEVELS):
+        found = [info for info, each in zip(infos, spelt, strict=True) if each[level] == target]
+        if found:
+            return found
+    return []
+
+
+def references(module: str, node: str, name: str) -> tuple[str, ...]:
+    """Return the references that mean a parameter, or more; of two that are spelt alike, the first one counts."""
+    path = f"{module}/{node}"
+    return module, path, f"{path}.{name}", f"{path}/{name}", node, f"{node}.{name}"
+
+
+def one_module(infos: Infos, target: str) -> str:
+    """Return the module of these parameters. Raises UsageError if they are of several."""
+    modules = list(dict.fromkeys(info.module for info in infos))
+    if len(modules) > 1:
+        choices = ", ".join(dict.fromkeys(f"{info.module}/{info.node}" for info in infos))
+        raise UsageError(f"{target} is in several modules: choose one of {choices}")
+    return modules[0]
+
+
+def with_name(module: str, modules: Iterable[str]) -> str | None:
+    """Return the module of this name, else the only one behind a prefix: `PC1` is `robot1/PC1` for the others."""
+    modules = list(modules)
+    behind = [each for each in modules if each.rpartition("/")[2] == module]
+    return module if module in modules else behind[0] if len(behind) == 1 else None
+
+
+def similar(wanted: str, known: Iterable[str], what: str) -> str:
+    """Return the end of an error about an unknown name: the nearest of the known ones, else the first of them."""
+    known = list(dict.fromkeys(known))
+    close = difflib.get_close_matches(wanted, known, n=1)
+    if close:
+        return f"; did you mean {close[0]}?"
+    more = f" and {len(known) - _SHOWN} more" if len(known) > _SHOWN else ""
+    return f"; {what}: {', '.join(known[:_SHOWN]) or 'none'}{more}"
+
+
+async def _ask(session: Session, modules: list[str], *, may_fail: bool) -> Infos:
+    """Return what modules answer, in their order. Where one `may_fail`, that is only reported."""
+    limit = asyncio.Semaphore(_AT_ONCE)
+
+    async def ask(module: str) -> Infos:
+        async with limit:
+            try:
+                return await session.module.network.parameters(module)
+            except (r2p.Error, TimeoutError) as error:
+                if not may_fail:
+                    raise TimedOut(str(error)) if isinstance(error, TimeoutError) else error from None
+                notify(str(error))
+                return []
+
+    with session.waiting(f"the parameters of {', '.join(modules)}"):
+        return [info for found in await asyncio.gather(*map(ask, modules)) for info in found]
+
+
+def _prefix(session: Session, target: str | None) -> list[str]:
+    """Return the known modules whose name a reference begins with: the longest, as names may begin alike."""
+    names = {view.name for view in session.module.network.modules() if view.link}
+    found = [name for name in names if target is not None and f"{target}/".startswith(f"{name}/")]
+    return [max(found, key=len)] if found else []
+
+
+def _named(infos: Infos, names: list[str], target: str) -> Infos:
+    """Return the parameters of these names, in this order; all without names. Raises r2p.Error for an unknown one."""
+    found: Infos = []
+    for name in names:
+        chosen = [info for info in infos if name == info.name]
+        if not chosen:
+            raise r2p.Error(f"{target} has no parameter {name}{similar(name, (i.name for i in infos), 'it has')}")
+        found += chosen
+    return found if names else infos
+
+
+def _unknown(session: Session, target: str, modules: list[str], infos: Infos) -> Exception:
+    """Return the error for a reference that means nothing."""
+    nodes = [f"{info.module}/{info.node}" for info in infos]
+    if "/" not in target and target.partition(".")[0] not in modules:
+        where = f"module or node {target} with parameters on {session.network_name}"
+        known = [*modules, *(info.node for info in infos), *nodes]
+        return TimedOut(f"there is no {where}{similar(target, known, 'there are')}")
+    if not infos:
+        return r2p.Error(f"no node of {', '.join(modules)} has parameters")
+    node, name = _divided(target, nodes)
+    if name is not None:
+        own = [info.name for info in infos if f"{info.module}/{info.node}" == node]
+        return r2p.Error(f"{node} has no parameter {name}{similar(name, own, 'it has')}")
+    return r2p.Error(f"there is no node {target} with parameters{similar(target, nodes, 'there are')}")
+
+
+def _divided(target: str, nodes: list[str]) -> tuple[str, str | None]:
+    """Return the known node that a reference begins with, and the name behind it."""
+    for node in sorted(nodes, key=len, reverse=True):
+        if target.startswith((f"{node}.", f"{node}/")):
+            return node, target[len(node) + 1 :]
+    return target, None

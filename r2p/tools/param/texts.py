@@ -1,0 +1,118 @@
+"""Parameters as people, programs and files read them."""
+
+import math
+from typing import Any
+
+import tomli_w
+
+import r2p
+from r2p.log_lines import printable
+from r2p.tools.session import UsageError
+
+COLUMNS = ["node", "name", "value", "unit", "range", "origin"]
+"""The columns of a table for people."""
+
+FIELDS = [
+    *("module", "node", "name", "kind", "value", "default", "minimum", "maximum", "unit", "doc", "read_only"),
+    *("choices", "origin", "saved", "problem"),
+]
+"""The keys of a record for programs, in their order."""
+
+
+def record(info: r2p.ParameterInfo) -> dict[str, Any]:
+    """Return a parameter as values for JSON."""
+    return {name: plain(getattr(info, name)) for name in FIELDS}
+
+
+def row(info: r2p.ParameterInfo) -> dict[str, Any]:
+    """Return a parameter as a row of a table for people."""
+    return {
+        "node": f"{info.module}/{info.node}",
+        "name": info.name,
+        "value": shown(info, info.value),
+        "unit": info.unit or None,
+        "range": range_text(info) or None,
+        "origin": info.origin,
+    }
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it: infinities as texts, as in messages, and tuples as lists."""
+    if isinstance(value, tuple):
+        return [plain(each) for each in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def value_text(value: Any) -> str:
+    """Return a value as TOML has it, on one line: the text that files and people read."""
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(value_text, value))}]"
+    return tomli_w.dumps({"v": value}).removeprefix("v = ").rstrip("\n")
+
+
+def shown(info: r2p.ParameterInfo, value: Any) -> str:
+    """Return a value of a parameter as people read and write it: as in a file, but names of an enum without quotes."""
+    return str(value) if info.choices else value_text(value)
+
+
+def with_unit(info: r2p.ParameterInfo, value: Any) -> str:
+    """Return a value with its unit."""
+    return f"{shown(info, value)} {info.unit}".rstrip()
+
+
+def range_text(info: r2p.ParameterInfo) -> str:
+    """Return what a parameter takes, in words: limits or names, or that it is read-only; empty for anything."""
+    if info.read_only:
+        return "read-only"
+    if info.choices:
+        return ", ".join(info.choices)
+    match info.minimum, info.maximum:
+        case None, None:
+            return ""
+        case low, None:
+            return f"{low} or more"
+        case None, high:
+            return f"{high} or less"
+        case low, high:
+            return f"{low} to {high}"
+
+
+def details(info: r2p.ParameterInfo) -> str:
+    """Return everything about a parameter, for people."""
+    saved = "" if info.problem else "no" if info.saved is None else shown(info, info.saved)
+    found = {
+        "parameter": info.full_name,
+        "value": shown(info, info.value),
+        "origin": info.origin,
+        "saved": saved,
+        "default": shown(info, info.default),
+        "kind": info.kind,
+        "range": range_text(info),
+        "unit": info.unit,
+        "doc": info.doc,
+        "problem": info.problem,
+    }
+    return "".join(f"{name}: {value}\n" for name, value in found.items() if value)
+
+
+def dumped(infos: list[r2p.ParameterInfo]) -> str:
+    """Return parameters as a file that --params and `r2p param load` read. Raises UsageError for two robots in one.
+
+    Modules have the names that they have themselves, without the prefix of a gateway.
+    """
+    lines, table, modules = ["format = 1"], "", dict[str, str]()
+    for info in infos:
+        module = info.module.rpartition("/")[2]
+        if modules.setdefault(module, info.module) != info.module:
+            raise UsageError(f"{modules[module]} and {info.module} are both {module} in a file: dump one of them")
+        if table != (table := f"[params.{module}.{info.node}]"):
+            lines += ["", table]
+        lines.append(_dumped_line(info))
+    return "\n".join(lines) + "\n"
+
+
+def _dumped_line(info: r2p.ParameterInfo) -> str:
+    key = tomli_w.dumps({info.name: 0}).rpartition(" = ")[0]
+    about = ", ".join(filter(None, (info.unit, range_text(info))))
+    comment = printable(": ".join(filter(None, (about, info.doc))))
+    return f"{key} = {value_text(info.value)}" + (f"  # {comment}" if comment else "")
