@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -22,7 +24,8 @@ if TYPE_CHECKING:
 
     from r2p.codecs.loader import LinkingSetup
 
-pytestmark = pytest.mark.virtual_time
+virtual = pytest.mark.virtual_time
+NO_PTY = pytest.mark.skipif(sys.platform == "win32", reason="no pseudo terminals")
 
 
 async def until(condition: Callable[[], object], limit: float = 20.0) -> None:
@@ -36,8 +39,13 @@ def state(module: r2p.Module, name: str) -> str:
 
 
 async def order(module: r2p.Module, command: r2p.Command, name: str, state_after: str) -> None:
-    module.command(command, name)
-    await until(lambda: state(module, name) == state_after)
+    """Send a command, which may get lost, until the module has obeyed."""
+    for _ in range(20):
+        module.command(command, name)
+        with contextlib.suppress(TimeoutError):
+            await until(lambda: state(module, name) == state_after, 1.0)
+            return
+    raise TimeoutError(f"{name} is {state(module, name)}")
 
 
 async def found_on(module: r2p.Module, board: str) -> list[str]:
@@ -72,11 +80,13 @@ async def use_loader(pc: r2p.Module, board: Board) -> None:
             assert await anext(aiter(subscriber)) == Float32(data=TEXT[CONFIG.start])
 
 
+@virtual
 async def test_a_board_on_the_bus_gets_an_app_and_runs_it() -> None:
     async with Board("IMU1", via="sim:robot") as board, r2p.Module("PC1", via="sim:robot") as pc:
         await use_loader(pc, board)
 
 
+@virtual
 async def test_a_board_behind_two_gateways_gets_an_app_and_runs_it() -> None:
     async with (
         Board("IMU1", via="sim:robot") as board,
@@ -87,6 +97,7 @@ async def test_a_board_behind_two_gateways_gets_an_app_and_runs_it() -> None:
         await use_loader(pc, board)
 
 
+@virtual
 @pytest.mark.parametrize("allow_control", [False, True])
 async def test_a_loader_behind_a_gateway_is_for_ip_links_with_permission(
     monkeypatch: pytest.MonkeyPatch, allow_control: bool
@@ -108,6 +119,7 @@ async def test_a_loader_behind_a_gateway_is_for_ip_links_with_permission(
         assert bool(board.boot.loader.requests) == allow_control
 
 
+@virtual
 async def test_firmware_behind_a_gateway_gets_an_app() -> None:
     async with (
         Powered(FirmwareModule("IMU1", behind_gateway=True)) as power,
@@ -121,6 +133,19 @@ async def test_firmware_behind_a_gateway_gets_an_app() -> None:
         assert await found_on(pc, "IMU1") == ["APP1"]
 
 
+@pytest.mark.anyio
+@pytest.mark.parametrize("kind", ["tcp", pytest.param("serial", marks=NO_PTY)])
+async def test_firmware_on_a_real_line_gets_an_app(kind: str) -> None:
+    async with Powered(FirmwareModule("IMU1", repeats=False)) as power:
+        url = "serial:" + power.open_pty() if kind == "serial" else "tcp:{}:{}".format(*await power.listen())
+        async with r2p.Module("PC1", via=url) as pc:
+            await order(pc, r2p.Command.BOOTLOAD, "IMU1", "boot")
+            async with node_in(pc) as node:
+                await run(node, "BOOT_IMU1", load())
+            assert await found_on(pc, "IMU1") == ["APP1"]
+
+
+@virtual
 async def test_commands_lead_to_the_loader_of_a_robots_board_and_back() -> None:
     """Its nodes end meanwhile; its flash keeps the app without power."""
     async with (
@@ -144,6 +169,7 @@ async def test_commands_lead_to_the_loader_of_a_robots_board_and_back() -> None:
         assert all(node.running for node in board.nodes.values())
 
 
+@virtual
 async def test_a_stop_in_boot_mode_makes_a_board_deaf_until_its_power_is_cut() -> None:
     async with Board("IMU1", via="memory:lab") as board, r2p.Module("PC1", via="memory:lab") as pc:
         await board.bootload()
@@ -159,6 +185,7 @@ async def test_a_stop_in_boot_mode_makes_a_board_deaf_until_its_power_is_cut() -
         assert not again.stopped
 
 
+@virtual
 async def test_an_app_that_halts_a_board_ends_its_nodes() -> None:
     async with Board("IMU1", via="memory:lab") as board, r2p.Module("PC1", via="memory:lab") as pc:
         await board.bootload()
