@@ -103,7 +103,7 @@ class LoaderClient:
         self._module.query()
         await self._until(lambda: self.view() is not None, _FIRST_STATE)  # firmware may announce itself later, or never
         view = self.view()
-        if view is not None and view.instance is not None:
+        if view is not None and not view.has_loader:
             raise LoaderError(f"{self.name} is an r2p module, a program without a boot loader: apps are for firmware")
         if view is None or view.state != "boot":
             await self._order(r2p.Command.BOOTLOAD, lambda _: self._state() == "boot")

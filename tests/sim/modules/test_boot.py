@@ -11,6 +11,7 @@ import pytest
 
 import r2p
 from r2p.bridge import BridgeOptions
+from r2p.loader import LoaderClient
 from r2p.msg import Float32
 from r2p.sim.modules import Board, FirmwareModule, Powered
 from r2p.sim.robots.emulated import Triskar2
@@ -167,6 +168,23 @@ async def test_commands_lead_to_the_loader_of_a_robots_board_and_back() -> None:
         await reboot(session, "PROX1")
         assert state(session.module, "PROX1") == "running"
         assert all(node.running for node in board.nodes.values())
+
+
+@virtual
+async def test_the_client_of_loaders_works_with_a_robots_board_through_its_gateway() -> None:
+    async with (
+        Triskar2("sim:robot", modules=["PS", "GW"], outside=["memory:lab"]) as robot,
+        r2p.Module("PC1", via="memory:lab") as pc,
+    ):
+        async with LoaderClient(pc, "PS") as loader:
+            await loader.enter()
+            assert (await loader.list_apps()).apps == ()
+            await loader.enter(restart=True)
+            assert (await loader.list_apps()).apps == ()
+            await loader.leave()
+        board = robot.modules["PS"]
+        assert all(node.running for node in board.nodes.values())
+        assert state(pc, "PS") == "running"
 
 
 @virtual
