@@ -5,12 +5,16 @@ They run as well, so that what the checkers believe is what there is.
 
 from __future__ import annotations
 
-from typing import assert_type
+import enum
+from typing import TYPE_CHECKING, Any, assert_type
 
 import pytest
 
 import r2p
 from r2p.msg import Encoder, Led
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 
 class Lamp(r2p.Message):
@@ -74,6 +78,35 @@ async def ask(node: r2p.Node) -> None:
         node.client("lamp", Lamp)  # type: ignore[arg-type]
 
 
+class Gear(enum.Enum):
+    LOW = 1
+    HIGH = 2
+
+
+async def tune(node: r2p.Node) -> None:
+    kp = node.parameter("kp", 0.5, min=0, max=10.0, check=lambda value: None if value else "not 0")
+    assert_type(kp, r2p.Parameter[float])
+    assert_type(kp.value, float)
+    assert_type(node.parameter("enabled", True), r2p.Parameter[bool])
+    assert_type(node.parameter("steps", 3), r2p.Parameter[int])
+    assert_type(node.parameter("label", "left"), r2p.Parameter[str])
+    assert_type(node.parameter("gear", Gear.LOW), r2p.Parameter[Gear])
+    assert_type(node.parameter("bias", (0.0, 1.0)), r2p.Parameter[tuple[float, float]])
+    kp.set(2)
+    assert (kp.value, type(kp.value)) == (2.0, float)
+
+    def above(value: float, values: Mapping[str, Any]) -> str | None:
+        return None if value > values["kp"] else "too low"
+
+    node.parameter("limit", 3.0, check=above, on_change=lambda value: assert_type(value, float))
+    with pytest.raises(r2p.ParameterError):
+        kp.set("fast")  # type: ignore[arg-type]
+    with pytest.raises(r2p.ParameterError):
+        node.parameter("list", [1.0])  # type: ignore[type-var]
+    with pytest.raises(AttributeError):
+        kp.value = 1.0  # type: ignore[misc]
+
+
 async def mistake(node: r2p.Node) -> None:
     with pytest.raises(r2p.MessageError):
         node.subscribe("leds", int)  # type: ignore[type-var]
@@ -92,6 +125,7 @@ async def test_what_type_checkers_see_is_what_there_is() -> None:
     async with r2p.Module("PC1", via=[]) as module:
         module.start(talk)
         module.start(ask)
+        module.start(tune)
         module.start(mistake)
         await module.wait()
     assert last_stamp([r2p.Sample(b"", r2p.Source(), 5)]) == 5

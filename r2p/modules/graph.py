@@ -14,10 +14,11 @@ import msgspec
 from r2p.clock import check_seconds
 from r2p.codecs.management import FLAG_BOOT, FLAG_LOADER, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES, WIRE_VERSION
 from r2p.codecs.own_services import WIRE_MIN, Operation
-from r2p.errors import DecodeError, Error, ParameterError
+from r2p.errors import DecodeError, Error, ParameterError, ServiceError
 from r2p.messages import Layout, Message
 from r2p.modules import parameter_services
 from r2p.modules.link_manager import LinkManager
+from r2p.modules.own_services import unknown_operation
 from r2p.modules.statistics import ModuleStatistics, decode
 from r2p.modules.type_lookup import find_type
 from r2p.parameters.definition import ParameterInfo
@@ -156,6 +157,11 @@ class NetworkView:
             if operation.changes:
                 text += "; whether it has made the change is unknown"
             raise TimeoutError(text) from None
+        except ServiceError as error:
+            if str(error) != unknown_operation(operation):
+                raise
+            text = f"{module} has r2p {view.release or 'of an earlier version'}, which knows no {what}: update it there"
+            raise Error(text) from None
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
         """Ask the modules on the network for a message class of this layout; None without an answer.

@@ -300,7 +300,7 @@ class OwnServices:
     def _handler(self, operation: int) -> Handler:
         handler = self._handlers.get(operation)
         if handler is None:
-            raise LookupError(f"operation {operation} is unknown to this version of r2p")
+            raise LookupError(unknown_operation(operation))
         return handler
 
     def _remembered(self, call: OwnCall) -> tuple[RememberedAnswers, int]:
@@ -411,6 +411,11 @@ class OwnServices:
         header = ServiceHeader(call.header.instance, call.header.number, kind, self._instance)
         pages, edition = (0, 0) if content is None else (content.pages, content.edition)
         return own_services.encode(OwnCall(header, call.operation, call.page, pages, edition, body))
+
+
+def unknown_operation(operation: int) -> str:
+    """Return the text with which a module answers an operation that its version of r2p does not have."""
+    return f"operation {operation:d} is unknown to this version of r2p"
 
 
 def may_answer(link: Link, info: ModuleInfo) -> bool:

@@ -148,7 +148,10 @@ async def change(ask: Ask, module: str, values: Mapping[Name, object]) -> None:
     stage = 0
     for offset in range(0, len(data), _PART_MAX):
         part = codec.encode_part(stage, offset, data[offset : offset + _PART_MAX])
-        stage = codec.decode_count(await _asked(ask, Operation.PARAMETER_STAGE, part))
+        try:
+            stage = codec.decode_count(await _asked(ask, Operation.PARAMETER_STAGE, part))
+        except TimeoutError as error:
+            raise TimeoutError(f"{str(error).partition(';')[0]}: nothing was set") from None
     if stage:
         await _asked(ask, Operation.PARAMETER_COMMIT, codec.encode_part(stage, len(data)))
 

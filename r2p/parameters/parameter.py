@@ -37,13 +37,14 @@ class Parameter(Generic[T]):
     `changes()` and the `on_change` of `Node.parameter` tell of it.
     """
 
-    __slots__ = ("_changed", "_on_change", "_registry", "count", "definition", "origin_number", "owner", "value")
-
-    if TYPE_CHECKING:  # a slot that only the registry writes
+    if TYPE_CHECKING:  # it is a slot, which costs less to read, and which only the registry writes
 
         @property
         def value(self) -> T:
             """The value that counts now."""
+
+    else:
+        __slots__ = ("_changed", "_on_change", "_registry", "count", "definition", "origin_number", "owner", "value")
 
     def __init__(
         self,

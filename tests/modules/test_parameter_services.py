@@ -191,6 +191,26 @@ async def test_errors_name_what_is_wrong() -> None:
 
 
 @pytest.mark.virtual_time
+async def test_a_set_whose_last_answer_is_lost_may_have_been_made_and_says_so() -> None:
+    network = MemoryNetwork()
+    async with two(network) as (a, b):
+        a.parameters["speed", "kp"]._on_change = lambda _: setattr(network, "loss", 1.0)
+        with pytest.raises(TimeoutError, match="whether it has made the change is unknown"):
+            await b.network.set_parameters("A", {("speed", "kp"): 3.0})
+        assert value(a, "kp") == 3.0
+
+
+@pytest.mark.virtual_time
+async def test_a_module_of_before_parameters_is_named() -> None:
+    async with two(MemoryNetwork()) as (a, b):
+        for operation in (Operation.PARAMETERS, Operation.PARAMETER_STAGE):
+            del services(a)._handlers[operation]
+        for asking in (b.network.parameters("A"), b.network.set_parameters("A", {("speed", "kp"): 3.0})):
+            with pytest.raises(r2p.Error, match=rf"A has r2p {r2p.__version__}, which knows no parameters: update it"):
+                await asking
+
+
+@pytest.mark.virtual_time
 async def test_a_set_while_the_link_is_down_for_a_moment_and_for_longer() -> None:
     network = MemoryNetwork()
     async with two(network) as (a, b):
@@ -202,7 +222,7 @@ async def test_a_set_while_the_link_is_down_for_a_moment_and_for_longer() -> Non
             if pause < 1.5:
                 await setting
             else:
-                with pytest.raises(TimeoutError, match=r"module A does not answer.*whether it has made the change"):
+                with pytest.raises(TimeoutError, match=r"module A does not answer, .* last message: nothing was set"):
                     await setting
             assert value(a, "kp") == 3.0
             await until(lambda: knows(b, a))
