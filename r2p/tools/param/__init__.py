@@ -1,8 +1,8 @@
 """`r2p param`: the group of commands.
 
 `reading` (`list`, `get`, `info`, `dump`, `watch`) and `changing` (`set`, `load`, `reset`, `save`) are the commands.
-`arguments` are their arguments, `targets` finds the parameters that these mean, and `texts`
-writes them for people and for files.
+`arguments` are their arguments, `targets` finds the parameters that these mean, `texts` writes them
+for people and for files, and `firmware` does `list`, `get` and `set` with the config area of an app of firmware.
 """
 
 from r2p.tools import session

@@ -16,7 +16,9 @@ from r2p.parameters.sources import TABLE, read_tables, read_toml
 from r2p.tools.module import unknown_module
 from r2p.tools.options import Format
 from r2p.tools.output import Output, notify
+from r2p.tools.param import firmware as on_firmware
 from r2p.tools.param.arguments import Assignments, MaybeTarget, ModuleName, Names, Target
+from r2p.tools.param.firmware import App, As, Raw, Reboot
 from r2p.tools.param.targets import Infos, find, find_modules, one_module, references, similar, with_name
 from r2p.tools.param.texts import plain, shown, with_unit
 from r2p.tools.session import Session, TimedOut, UsageError
@@ -33,14 +35,24 @@ async def set_(
     target: Target,
     assignments: Assignments = None,
     *,
+    firmware: App = None,
+    as_: As = None,
+    raw: Raw = None,
+    reboot: Reboot = False,
     format: Format = None,
 ) -> None:
     """Set parameters of a module, one or several: all of them or, if one is refused, none.
 
-    The module must let it in: over TCP and zenoh with --allow-control or a key.
+    The module must let it in: over TCP and zenoh with --allow-control or a key. With --firmware APP, fields of an app
+    in the flash of firmware are set, and read back.
     """
     output = Output(format)
     words = [*(assignments or [])]
+    if firmware is not None:
+        async with on_firmware.config_area(session, target, firmware, as_, raw, reboot=reboot) as area:
+            await on_firmware.set_(area, output, words)
+        return
+    on_firmware.check_unused(as_, raw, reboot=reboot)
     reference, pairs = _assigned(target, words)
     infos = await find(session, reference)
     values = _values(infos, reference, pairs)

@@ -8,7 +8,9 @@ import r2p
 from r2p.tools.log import clock_text
 from r2p.tools.options import Count, Format, Once, Timeout, Wait
 from r2p.tools.output import Output, notify
+from r2p.tools.param import firmware as on_firmware
 from r2p.tools.param.arguments import MaybeTarget, Names, Target
+from r2p.tools.param.firmware import App, As, Raw, Reboot
 from r2p.tools.param.targets import find, find_modules, meant
 from r2p.tools.param.texts import COLUMNS, FIELDS, details, dumped, plain, record, row, shown, with_unit
 from r2p.tools.session import Session, patience
@@ -20,11 +22,23 @@ async def list_(
     session: Session,
     target: MaybeTarget = None,
     *,
+    firmware: App = None,
+    as_: As = None,
+    raw: Raw = None,
+    reboot: Reboot = False,
     wait: Wait = None,
     format: Format = None,
 ) -> None:
-    """List parameters: of all modules, of one, or of a node."""
+    """List parameters: of all modules, of one, or of a node.
+
+    With --firmware APP those of an app in the flash of firmware, whose fields --as describes.
+    """
     output = Output(format)
+    if firmware is not None:
+        async with on_firmware.config_area(session, target, firmware, as_, raw, reboot=reboot) as area:
+            await on_firmware.list_(area, output)
+        return
+    on_firmware.check_unused(as_, raw, reboot=reboot)
     infos = await find(session, target, wait=wait)
     if output.format == "text":
         await output.table([row(info) for info in infos], COLUMNS)
@@ -39,10 +53,22 @@ async def get(
     target: Target,
     names: Names = None,
     *,
+    firmware: App = None,
+    as_: As = None,
+    raw: Raw = None,
+    reboot: Reboot = False,
     format: Format = None,
 ) -> None:
-    """Print the values of parameters: of a node, or those that are named."""
+    """Print the values of parameters: of a node, or those that are named.
+
+    With --firmware APP those of an app in the flash of firmware.
+    """
     output = Output(format)
+    if firmware is not None:
+        async with on_firmware.config_area(session, target, firmware, as_, raw, reboot=reboot) as area:
+            await on_firmware.get(area, output, names or [])
+        return
+    on_firmware.check_unused(as_, raw, reboot=reboot)
     for info in await find(session, target, names or []):
         brief = {"module": info.module, "node": info.node, "name": info.name, "value": plain(info.value)}
         await output.put(brief | {"unit": info.unit}, f"{info.full_name} = {with_unit(info, info.value)}")

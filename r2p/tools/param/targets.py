@@ -58,7 +58,10 @@ async def find_modules(session: Session, target: str | None, wait: float | None 
     names = _prefix(session, target)
     known = {view.name: view for view in session.module.network.modules() if view.link and view.state != "observer"}
     if names and all(known[name].instance is None for name in names):
-        raise r2p.Error(f"{names[0]} is firmware: it has no parameters that others can ask for")
+        raise r2p.Error(
+            f"{names[0]} is firmware: its parameters are bytes of its apps. With --firmware APP, r2p param list, get "
+            "and set work on them"
+        )
     if not names and target is not None and "/" in target:
         raise TimedOut(unknown_module(session, target.partition("/")[0]))
     return names or sorted(name for name, view in known.items() if view.instance is not None)

@@ -199,6 +199,7 @@ async def test_a_missing_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     [
         (["set", "BOT/drive", "kp", "-0.5"], 2, "no network to look for parameters on"),
         (["set", "BOT/drive", "--kp"], 2, "no network"),
+        (["list", "--raw", "0:1"], 2, "--raw is for the parameters of firmware: give --firmware APP, too"),
         (["get"], 2, "Missing argument 'MODULE/NODE'"),
     ],
 )

@@ -199,7 +199,7 @@ async def test_watch_ends_without_changes(capsys: pytest.CaptureFixture[str]) ->
         ("BOT/drvie", [], r2p.Error, r"there is no node BOT/drvie with parameters; did you mean BOT/drive\?"),
         ("BOT/drive", ["kpp"], r2p.Error, r"BOT/drive has no parameter kpp; did you mean kp\?"),
         ("BOT/drive.zz", [], r2p.Error, "BOT/drive has no parameter zz; it has: kp, limits.left, mode, serial, top"),
-        ("IMU1", [], r2p.Error, "IMU1 is firmware: it has no parameters that others can ask for"),
+        ("IMU1", [], r2p.Error, "IMU1 is firmware: its parameters are bytes of its apps. With --firmware APP"),
     ],
 )
 async def test_wrong_names(target: str, names: list[str], error: type[Exception], text: str) -> None:
