@@ -26,13 +26,17 @@ from rich.text import Text
 import r2p
 from r2p import sim
 from r2p.bridge import BridgeOptions
+from r2p.codecs.parameters import Origin
 from r2p.msg import Odometry
+from r2p.parameters.sources import ParameterSource, from_options, of_module, read_file
+from r2p.sim.modules.boards import ParameterOptions
 from r2p.sim.physics.world import Triple, Wall, World, box
-from r2p.sim.robots.emulated import Triskar2
+from r2p.sim.robots.emulated import MODULES, Triskar2
 from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, OdometryFigures, TopicFigures, WheelFigures
 from r2p.sim.robots.triskar2 import square
-from r2p.tools.options import Quiet, Verbose, Via, time_option
-from r2p.tools.session import UsageError, check_urls, execute, moments
+from r2p.tools.config import CONFIG, Settings, did_you_mean
+from r2p.tools.options import Params, ParamsFile, Quiet, Verbose, Via, time_option
+from r2p.tools.session import UsageError, check_urls, execute, moments, settings
 
 DEBUG = "tcp-listen:0"
 """The debug line, on the loopback interface, at a free port."""
@@ -80,6 +84,12 @@ def command(
     allow_control: Annotated[
         bool, typer.Option("--allow-control", help="Let the gateway accept REBOOT, BOOTLOAD and changes from IP links.")
     ] = False,
+    params_file: ParamsFile = None,
+    params: Params = None,
+    param: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[MODULE/]NODE.NAME=VALUE", help="Start with this value of a parameter (repeatable)."),
+    ] = None,
     via: Via = None,
     verbose: Verbose = 0,
     quiet: Quiet = 0,
@@ -93,6 +103,9 @@ def command(
         if fast and via:
             raise UsageError("--fast runs in virtual time, so other programs can't connect: leave out --via or --fast")
         check_urls(via or [])
+        chosen = settings()
+        sources = parameter_sources(chosen, params or (), param or ())
+        parameters = ParameterOptions(params=sources, params_file=params_file or chosen.params_file)
         await simulate(
             duration=duration or (_FAST if fast else None),
             seed=seed,
@@ -101,18 +114,26 @@ def command(
             fast=fast,
             bus=bus,
             allow_control=allow_control,
+            parameters=parameters,
         )
-
-    def virtually(main: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which Python raises itself
-        try:
-            sim.run(main, seed=seed)
-        finally:
-            signal.signal(signal.SIGTERM, before)
 
     # Only errors are logged: any other line would tear the display apart.
     endless = duration is None and not fast
-    execute(main, verbose=verbose, quiet=quiet + 2, endless=endless, run=virtually if fast else None)
+    execute(
+        main,
+        verbose=verbose,
+        quiet=quiet + 2,
+        endless=endless,
+        run=functools.partial(_run_virtually, seed) if fast else None,
+    )
+
+
+def _run_virtually(seed: int, main: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which Python raises itself
+    try:
+        sim.run(main, seed=seed)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def default_links() -> list[str]:
@@ -129,18 +150,23 @@ async def simulate(
     fast: bool = False,
     bus: bool = False,
     allow_control: bool = False,
+    parameters: ParameterOptions | None = None,
 ) -> None:
     """Run the robot and show its figures, for `duration` seconds or until cancelled.
 
     `outside`: URLs that the gateway opens. `laps`: of a square that a PC drives. `fast`: under virtual time. `bus`:
-    print bus statistics at the end. `allow_control`: the gateway accepts REBOOT, BOOTLOAD and changes.
+    print bus statistics at the end. `allow_control`: the gateway accepts REBOOT, BOOTLOAD and changes. `parameters`:
+    what those of the modules are at first. Raises UsageError for one that no module has, or a value that does not fit.
     """
     world = World(box(SIDE / 2, SIDE / 2, 3.8, 3.8))
     screen = SimulatorScreen(world, live=not fast, duration=duration)
     can = sim.can_bus(_NAME, seed=seed)
     bridge = BridgeOptions(allow_control=allow_control)
-    robot = Triskar2(f"sim:{_NAME}", seed=seed, world=world, outside=[*outside, _INSIDE], options=bridge)
+    robot = Triskar2(
+        f"sim:{_NAME}", seed=seed, world=world, outside=[*outside, _INSIDE], options=bridge, parameters=parameters
+    )
     async with robot, r2p.Module("PC1", via=_INSIDE, watchdog=False) as pc:
+        _check_parameters(robot)
         screen.print(
             f"Triskar2 starts: {len(robot.modules)} modules on a simulated RTCAN bus, which settles in about 2 s"
         )
@@ -162,6 +188,62 @@ async def simulate(
             screen.print_summary(figures, fast=fast)
             if bus:
                 screen.print("", *bus_table(can))
+
+
+def parameter_sources(
+    chosen: Settings, files: Iterable[Path], options: Iterable[str]
+) -> dict[str, list[ParameterSource]]:
+    """Return where values of parameters come from, for each module of the robot. Raises UsageError.
+
+    Options without a module are for all that have the parameter. Of several files, the last one wins.
+    """
+    of_modules: dict[str, list[str]] = {name: [] for name in MODULES}
+    of_all: list[str] = []
+    for option in options:
+        module, found, rest = option.partition("/")
+        if not found or "=" in module:
+            of_all.append(option)
+        elif module in of_modules:
+            of_modules[module].append(rest)
+        else:
+            hint = did_you_mean(module, MODULES, "modules")
+            raise UsageError(f"--param {option}: the robot has no module {module}; {hint}")
+    try:
+        shared, tables = from_options(of_all), [_of_file(path) for path in reversed([*files])]
+        return {
+            name: [
+                of_module(name, chosen.params, Origin.CONFIG, CONFIG),
+                *(table[name] for table in tables),
+                from_options(own),
+                shared,
+            ]
+            for name, own in of_modules.items()
+        }
+    except r2p.ParameterError as error:
+        raise UsageError(str(error)) from error
+
+
+def _of_file(path: Path) -> dict[str, ParameterSource]:
+    sources = {name: read_file(path, name) for name in MODULES}
+    if not any(source.values for source in sources.values()):
+        raise UsageError(f"{path} has no parameters of the robot's modules, {', '.join(MODULES)}")
+    return sources
+
+
+def _check_parameters(robot: Triskar2) -> None:
+    """Raise UsageError for values that were given for no parameter, or that do not fit.
+
+    All nodes have declared theirs: each runs its first step while the next module is opened.
+    """
+    unused: dict[str, list[str]] = {}
+    for board in robot.modules.values():
+        for supervisor in board.nodes.values():
+            if isinstance(supervisor.error, r2p.ParameterError):
+                raise UsageError(str(supervisor.error))
+        for each in board.parameters.unused():
+            unused.setdefault(each, []).append(board.name)
+    for name, modules in unused.items():
+        raise UsageError(f"no node of {modules[0] if len(modules) == 1 else 'the robot'} has a parameter {name}")
 
 
 async def _watch(node: r2p.Node, reader: FiguresReader) -> None:

@@ -21,11 +21,13 @@ from r2p import sim
 from r2p.msg import Pose3
 from r2p.runtime.publishers import PeriodicPublisher
 from r2p.sim import can_bus
+from r2p.sim.modules.boards import ParameterOptions
 from r2p.sim.physics.world import World, box
-from r2p.sim.robots.emulated import Triskar2
+from r2p.sim.robots.emulated import MOTORS, Triskar2
 from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, OdometryFigures, TopicFigures, WheelFigures
 from r2p.sim.robots.triskar2 import square
 from r2p.tools import simulator
+from r2p.tools.config import Settings
 from r2p.tools.main import app
 from r2p.tools.simulator import Map, default_links, program, simulate
 from tests.tools.rig import process
@@ -302,3 +304,48 @@ def test_fast_and_a_link_to_the_outside_do_not_go_together() -> None:
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 2
     assert "--fast runs in virtual time" in ended.stderr
+
+
+def test_parameters_come_from_files_and_options(tmp_path: Path) -> None:
+    """The last file wins, and options win over files; one with a module is for this module only."""
+    one, two = tmp_path / "one.toml", tmp_path / "two.toml"
+    one.write_text("[params.MOTOR1.motor]\nkp = 3\nki = 3\nkd = 3\n[params.MOTOR2.motor]\nkp = 3\n")
+    two.write_text("[params.MOTOR1.motor]\nki = 2\n[params.OTHER.motor]\nki = 9\n")
+    chosen = Settings(params={"MOTOR1": {("motor", "kd"): 1.0, ("motor", "timeout"): 1.0}})
+    options = ["motor.kp=4", "MOTOR3/motor.kp=5", "limits.low_voltage=2"]
+    given = simulator.parameter_sources(chosen, [one, two], options)
+
+    async def values() -> dict[str, dict[str, float]]:
+        async with Triskar2("memory:given", modules=MOTORS, parameters=ParameterOptions(params=given)) as robot:
+            await asyncio.sleep(0.1)
+            boards = robot.modules.items()
+            return {name: {each.name: each.value for each in board.parameters.values()} for name, board in boards}
+
+    found = sim.run(values)
+    assert {name: [each[key] for key in ("kp", "ki", "kd", "timeout")] for name, each in found.items()} == {
+        "MOTOR1": [4.0, 2.0, 3.0, 1.0],
+        "MOTOR2": [4.0, 30.0, 0.0, 0.2],
+        "MOTOR3": [5.0, 30.0, 0.0, 0.2],
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--param", "motor.kq=1"], "no node of the robot has a parameter motor.kq (--param)"),
+        (["--param", "PS/motor.kp=1"], "no node of PS has a parameter motor.kp (--param)"),
+        (["--param", "motor.kp=-1"], "it takes 0.0 V/(rad/s) or more (from --param)"),
+        (["--param", "MOTR1/motor.kp=1"], "the robot has no module MOTR1; did you mean MOTOR1?"),
+        (["--param", "motor.kp"], "write it as"),
+        (["--params", "missing.toml"], "there is no file missing.toml"),
+        (["--params", "other.toml"], "other.toml has no parameters of the robot's modules"),
+    ],
+)
+def test_parameters_that_the_robot_does_not_have_are_refused(
+    arguments: list[str], reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "other.toml").write_text("[params.ARM.motor]\nkp = 3\n")
+    result = CliRunner().invoke(app, ["sim", "--fast", "--duration", "1", *arguments])
+    assert result.exit_code == 2
+    assert reason in " ".join(result.output.replace("│", " ").split())

@@ -233,9 +233,9 @@ def tune(node: r2p.Node, drive: Drive) -> None:
     def chop(amperes: float) -> None:
         drive.motor.current_limit = amperes
 
-    kp = gain("kp", gains.kp, 100.0, units[0], "Proportional gain")
-    ki = gain("ki", gains.ki, 10_000.0, units[1], "Integral gain")
-    kd = gain("kd", gains.kd, 10.0, units[2], "Derivative gain, of what is measured")
+    kp = gain("kp", gains.kp, 100.0, units[0], "Proportional gain of the control of the wheel")
+    ki = gain("ki", gains.ki, 10_000.0, units[1], "Its integral gain; with 0 the wheel stays behind")
+    kd = gain("kd", gains.kd, 10.0, units[2], "Its derivative gain, of what is measured")
     limit = node.parameter(
         "voltage_limit", gains.limit, min=0.0, max=36.0, unit="V", doc="Highest voltage at the motor", on_change=control
     )

@@ -83,11 +83,17 @@ def calibrate(node: r2p.Node, sensors: RangeArray) -> None:
         min=1.0,
         max=10_000.0,
         unit="V mm",
-        doc="For each sensor: its voltage is scale / (distance + offset)",
+        doc="For each sensor: its voltage is scale / (distance in mm + offset)",
         on_change=change,
     )
     offset = node.parameter(
-        "offset", (curve.offset,) * 4, min=0.0, max=1000.0, unit="mm", doc="See scale", on_change=change
+        "offset",
+        (curve.offset,) * 4,
+        min=0.0,
+        max=1000.0,
+        unit="mm",
+        doc="For each sensor: see scale",
+        on_change=change,
     )
     longest = node.parameter(
         "longest",

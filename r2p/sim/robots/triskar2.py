@@ -116,10 +116,20 @@ async def obstacle_avoidance(node: r2p.Node, traffic: Traffic = "srt") -> None:
     If a proximity module is silent, the robot does not move in its direction.
     """
     stop = node.parameter(
-        "stop_distance", 0.15, min=0.0, max=0.8, unit="m", doc="The robot stops before an obstacle at this distance ..."
+        "stop_distance",
+        0.15,
+        min=0.0,
+        max=0.8,
+        unit="m",
+        doc="Distance to an obstacle at which the robot stops when it is slow",
     )
     braking = node.parameter(
-        "braking_time", 0.4, min=0.0, max=2.0, unit="s", doc="... and what it drives in this time at its present speed"
+        "braking_time",
+        0.4,
+        min=0.0,
+        max=2.0,
+        unit="s",
+        doc="The faster, the earlier: the distance grows by what it drives in this time",
     )
     sides = {angle: Latest(node, topic, Proximity, fresh=2 * FRESH) for topic, angle in SIDES.items()}
 
