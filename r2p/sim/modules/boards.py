@@ -8,6 +8,7 @@ What firmware has in its configuration are parameters of the nodes: they set the
 """
 
 import asyncio
+import contextlib
 import functools
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from pathlib import Path
@@ -20,10 +21,10 @@ import r2p
 from r2p.bridge import BridgeOptions
 from r2p.clock import Ticker
 from r2p.codecs.management import FLAG_BOOT, FLAG_LOADER, FLAG_REBOOTED
-from r2p.modules.supervisor import NodeFunction
+from r2p.modules.supervisor import NodeFunction, NodeOptions
 from r2p.msg import Battery, Encoder, Float32, Led, PowerEvent, Setpoint
 from r2p.parameters.sources import GivenParameters
-from r2p.sim.modules.boot import BoardBoot
+from r2p.sim.modules.boot import NODE, BoardBoot
 from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Threshold
 from r2p.sim.physics.world import ADC_MAX, ADC_REFERENCE, adc_counts
 from r2p.transports.link import Transport
@@ -118,11 +119,14 @@ class Board(r2p.Module):
     async def __aenter__(self) -> Self:
         """Open the module and start its nodes and apps. Raises as `r2p.Module` does."""
         await super().__aenter__()
-        self.boot.fault = ""
-        self._opened.set_flags(FLAG_LOADER)
-        for name, function in self._programs.items():
-            self.start(function, name=name)
-        await self._start_apps()
+        async with contextlib.AsyncExitStack() as opening:
+            opening.push_async_exit(self)
+            self.boot.fault = ""
+            self._opened.set_flags(FLAG_LOADER)
+            for name, function in self._programs.items():
+                self.start(function, name=name)
+            await self._start_apps()
+            opening.pop_all()
         return self
 
     async def __aexit__(
@@ -137,34 +141,44 @@ class Board(r2p.Module):
 
     async def stop(self) -> None:
         """End nodes and apps, as `r2p.Module` does. In boot mode, the board then obeys no command any more."""
-        if self.boot.in_boot_mode:
-            self.boot.halt(f"module {self.name}: STOP in boot mode, where its management hangs")
+        if self.boot.in_boot_mode and not self.boot.fault:
+            self.boot.halt(self._new_node(NODE), "STOP in boot mode: its management hangs until its power is cut")
         if not self.boot.fault:
             await self.boot.end()
             await super().stop()
 
-    async def reboot(self) -> None:
-        """End nodes and apps, or the loader, and start nodes and apps anew. Raises Closed if it is not open."""
-        if not self.boot.fault:
-            await self.boot.end()
-            await super().reboot()
-            self._opened.set_flags(FLAG_REBOOTED | FLAG_LOADER)
-            await self._start_apps()
-
     async def bootload(self) -> None:
-        """End nodes and apps, and start the loader, anew if it runs. Only `reboot` leaves it."""
+        """End nodes and apps, and start the loader, anew if it runs. Only `reboot` leaves it.
+
+        Raises Closed if the module is not open.
+        """
+        tasks = self._running()
+        await asyncio.shield(tasks.create_task(self._bootload(), name=f"{self.name} bootload"))
+
+    async def _bootload(self) -> None:
         if not self.boot.fault:
             await self.boot.end()
             await super().stop()
             self.rebooted = True
             self._opened.set_flags(FLAG_REBOOTED | FLAG_BOOT | FLAG_LOADER)
-            self.boot.start_loader(self.space)
+            self.boot.start_loader(self._new_node)
+
+    async def _reboot(self) -> None:
+        if not self.boot.fault:
+            await self.boot.end()
+            await super()._reboot()
+            if self._open:
+                self._opened.set_flags(self._opened.flags | FLAG_LOADER)
+                await self._start_apps()
 
     async def _start_apps(self) -> None:
-        self.boot.start_apps(self.space)
+        self.boot.start_apps(self._new_node)
         if self.boot.fault:
             await self.boot.end()
             await super().stop()
+
+    def _new_node(self, name: str) -> r2p.Node:
+        return self._make_node(name, NodeOptions())
 
 
 class Closes(Protocol):

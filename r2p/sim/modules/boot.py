@@ -12,22 +12,20 @@ from typing import Annotated
 import r2p
 from r2p.clock import Alarm, clock_of
 from r2p.codecs.loader import SIZE
-from r2p.log_lines import get_logger
 from r2p.names import LOADER_PREFIX, module_alias
-from r2p.runtime.node import Node
-from r2p.runtime.topic import TopicSpace
 from r2p.sim.modules.launch import Halted, starting
 from r2p.sim.modules.loader import QUEUE, EmulatedLoader
 
 NODE = "boot"
 """The name of the loader's node."""
 
+NodeMaker = Callable[[str], r2p.Node]
+"""Makes a node of the board."""
+
 BoardProgram = Callable[[r2p.Node, bytes], Awaitable[object]]
 """The node that an app is: a function of the node and the app's parameters."""
 
 _LOG_MAX = 100
-
-logger = get_logger("r2p.sim")
 
 
 class BootMessage(r2p.Message):
@@ -55,20 +53,23 @@ class BoardBoot:
         """Return whether the loader runs."""
         return any(task.get_name() == NODE for task in self._tasks)
 
-    def start_loader(self, space: TopicSpace) -> None:
+    def start_loader(self, make_node: NodeMaker) -> None:
         """Start the loader."""
-        self._run(NODE, space, self._serve)
+        self._run(make_node(NODE), self._serve)
 
-    def start_apps(self, space: TopicSpace) -> None:
+    def start_apps(self, make_node: NodeMaker) -> None:
         """Start the enabled apps."""
+        node = make_node(NODE)
         try:
             for app in starting(self.loader.apps, self.log):
-                logger.info("module %s: app %s started", space.module, app.name)
+                node.log.info("app %s started", app.name)
                 program = self.programs.get(app.name)
                 if program is not None:
-                    self._run(app.name, space, program, self.loader.apps.config(app))
+                    self._run(make_node(app.name), program, self.loader.apps.config(app))
         except Halted as error:
-            self.halt(str(error))
+            self.halt(node, str(error))
+        finally:
+            node.close()
 
     async def end(self) -> None:
         """End the loader or the apps."""
@@ -78,13 +79,13 @@ class BoardBoot:
         if tasks:
             await asyncio.wait(tasks)
 
-    def halt(self, fault: str) -> None:
-        """Let the board fail."""
+    def halt(self, node: r2p.Node, fault: str) -> None:
+        """Let the board fail; the node logs why."""
         self.fault = fault
-        logger.error("%s", fault)
+        node.log.error("%s", fault)
 
-    def _run(self, name: str, space: TopicSpace, program: Callable[..., Awaitable[object]], *args: object) -> None:
-        self._tasks.append(asyncio.create_task(_run(Node(name, space), program, *args), name=name))
+    def _run(self, node: r2p.Node, program: Callable[..., Awaitable[object]], *args: object) -> None:
+        self._tasks.append(asyncio.create_task(_run(node, program, *args), name=node.name))
 
     async def _serve(self, node: r2p.Node) -> None:
         """Hand messages to the loader, and publish its answers."""
@@ -99,7 +100,7 @@ class BoardBoot:
                 publisher.publish_nowait(BootMessage(data=tuple(answer)))
             alarm.set(loader.next_deadline())
             if loader.fault and not self.fault:
-                self.halt(f"module {node.module}: {loader.fault}")
+                self.halt(node, loader.fault)
 
         alarm = Alarm(loop, poll, background=True)
         loader.boot(clock.monotonic())
@@ -113,10 +114,10 @@ class BoardBoot:
             loader.stop()
 
 
-async def _run(node: Node, program: Callable[..., Awaitable[object]], *args: object) -> None:
+async def _run(node: r2p.Node, program: Callable[..., Awaitable[object]], *args: object) -> None:
     try:
         await program(node, *args)
     except Exception:
-        logger.exception("module %s: app %s has failed", node.module, node.name)
+        node.log.exception("%s has failed", node.name)
     finally:
         node.close()

@@ -204,11 +204,35 @@ async def test_a_stop_in_boot_mode_makes_a_board_deaf_until_its_power_is_cut() -
 
 
 @virtual
-async def test_an_app_that_halts_a_board_ends_its_nodes() -> None:
+async def test_a_node_may_restart_its_board_and_ends_by_that() -> None:
+    """To the loader and back, and an app that fails leaves the board alone."""
+
+    async def restart(node: r2p.Node, _config: bytes) -> None:
+        node.log.info("to the loader")
+        await board.bootload()
+
+    async def fail(node: r2p.Node, _config: bytes) -> None:
+        raise RuntimeError("a bug")
+
+    async with Board("IMU1", via="memory:lab") as board, r2p.Module("PC1", via="memory:lab") as pc:
+        board.boot.programs = {"FAILS": fail, "RESTARTS": restart}
+        await board.bootload()
+        async with node_in(pc) as node:
+            await run(node, "BOOT_IMU1", load("FAILS"))
+            await run(node, "BOOT_IMU1", load("RESTARTS"))
+        await board.reboot()
+        await until(lambda: board.boot.in_boot_mode)
+        assert list(board.boot.log) == ["LAUNCH FAILS", "LAUNCH RESTARTS"]
+        assert [view.has_loader for view in pc.network.modules()] == [False, True]
+
+
+@virtual
+async def test_an_app_that_halts_a_board_ends_its_nodes(caplog: pytest.LogCaptureFixture) -> None:
     async with Board("IMU1", via="memory:lab") as board, r2p.Module("PC1", via="memory:lab") as pc:
         await board.bootload()
         async with node_in(pc) as node:
             await run(node, "BOOT_IMU1", load(stack=64))
         await board.reboot()
         assert "a stack of 64 bytes is too small" in board.boot.fault
+        assert board.boot.fault in caplog.text
         assert board.stopped
