@@ -76,7 +76,8 @@ class CallRelay:
             return ""
         sealed = source.link.guard is not None
         if target.link.guard is not None and not sealed:  # this gateway does not lend its key
-            return f"gateway {gateway} passes no changes from {here}, without a key, to {there}: give {here} a key, too"
+            lacks = f"which has a key: give {here} one (?key=FILE)"
+            return f"gateway {gateway} passes no changes from {here} to {there}, {lacks}"
         reason = self._policy.change_denied(source.name, target.name, sealed=sealed)
         if reason == DENIED_READ_ONLY:
             return f"gateway {gateway} lets no changes onto {there}: it is started with --read-only for that link"

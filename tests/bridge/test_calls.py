@@ -240,7 +240,7 @@ async def test_each_gateway_seals_a_change_with_the_key_of_the_next_link(keys: t
 
 async def test_a_gateway_lends_its_key_to_no_change() -> None:
     async with robot_with_keys(None, KEY, KEY, allow_control=True) as (desk, first, b):
-        why = "gateway GW1 passes no changes from memory, without a key, to memory: give memory a key, too"
+        why = "gateway GW1 passes no changes from memory to memory, which has a key: give memory one "
         with pytest.raises(ServiceError, match=why):
             await change(desk, b)
         assert first.links[0].losses["change refused"] == 1
