@@ -197,7 +197,7 @@ class NetworkView:
         Raises as `set_parameters`; also ParameterError if the module has no file, or can't write it.
         """
         with self._explains_restarts(module):
-            return await parameter_services.save(self._asker(module))
+            return await parameter_services.save(self._asker(module), module)
 
     async def reset_parameters(self, module: str, node: str | None = None, names: Iterable[str] | None = None) -> int:
         """Undo what was set and saved, as `ModuleParameters.reset`: of a module, a node, or some of its parameters.

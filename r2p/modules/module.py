@@ -112,7 +112,7 @@ class Module:
         self.stopped = False
         """True after STOP has ended the nodes; REBOOT starts them again."""
         self.refused: dict[str, int] = {}
-        """Numbers of refused commands from the network, by name."""
+        """Numbers of refused commands and changes of parameters from the network, by name."""
         self.boot_loader: Callable[[], Awaitable[None]] | None = None
         """What carries out BOOTLOAD. Only emulated boards have it; programs on a PC refuse BOOTLOAD."""
         self.network = NetworkView(lambda: self._opened)
@@ -155,7 +155,7 @@ class Module:
             allow_control=self._allow_control,
         )
         self._opened.own_services.serve(Operation.STATISTICS, lambda _argument: encode(self.statistics()))
-        ParameterServices(self.parameters, self._opened.own_services, clock, self._opened.random)
+        ParameterServices(self.parameters, self._opened.own_services, clock, self._opened.random, self.refused)
         self._changed = asyncio.Event()
         self._switching = asyncio.Lock()
         self._log = None if self.observer else LogTopic(self.space, self._remap)

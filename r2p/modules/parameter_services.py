@@ -6,14 +6,15 @@ any value counts.
 """
 
 import asyncio
+import contextlib
 import random
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
 
 import msgspec
 
 from r2p.clock import Clock
 from r2p.codecs import parameters as codec
-from r2p.codecs.own_services import PAGE_MAX, Operation
+from r2p.codecs.own_services import PAGE_MAX, PAGES_MAX, Operation
 from r2p.codecs.parameters import Name, ParameterList
 from r2p.errors import DecodeError, Error, MessageError, ParameterError, ServiceError
 from r2p.log_lines import get_logger
@@ -32,6 +33,9 @@ STAGE_MAX = 1 << 16
 STAGE_AGE = 30 * SECOND
 """Ns after which a stage that nothing was added to is forgotten."""
 
+CONTENT_MAX = PAGES_MAX * PAGE_MAX
+"""Bytes of the longest list: about a thousand parameters."""
+
 _NUMBERS = 1 << 32  # of stages; 0 asks for a new one
 _PART_MAX = PAGE_MAX - len(codec.encode_part(0, 0))
 
@@ -44,14 +48,20 @@ class _StagedSet(msgspec.Struct, eq=False):
 
 
 class ParameterServices:
-    """Answers what other modules ask of a module's parameters."""
+    """Answers what other modules ask of a module's parameters; counts the changes that it refuses in `refused`."""
 
     def __init__(
-        self, parameters: ModuleParameters, services: OwnServices, clock: Clock, numbers: random.Random
+        self,
+        parameters: ModuleParameters,
+        services: OwnServices,
+        clock: Clock,
+        numbers: random.Random,
+        refused: dict[str, int],
     ) -> None:
         self._parameters = parameters
         self._clock = clock
         self._random = numbers
+        self._refused = refused
         self._stages: dict[int, _StagedSet] = {}
         services.serve(Operation.PARAMETERS, self._list)
         services.serve(Operation.PARAMETER_CHANGES, self._list_changes)
@@ -61,16 +71,34 @@ class ParameterServices:
         services.serve(Operation.PARAMETER_RESET, self._reset)
 
     def _list(self, argument: bytes) -> bytes:
-        infos = self._parameters.infos(_node(argument))
-        return codec.encode_list(ParameterList(self._parameters.revision, True, [*infos]))
+        return self._listed(self._parameters.infos(_node(argument)), whole=True)
 
     def _list_changes(self, argument: bytes) -> bytes:
         revision, parameters = codec.decode_count(argument), self._parameters
         whole = revision < parameters.declared or revision > parameters.revision
         infos = parameters.infos() if whole else parameters.changed_since(revision)
-        return codec.encode_list(ParameterList(parameters.revision, whole, [*infos]))
+        return self._listed(infos, whole=whole)
+
+    def _listed(self, infos: list[ParameterInfo], *, whole: bool) -> bytes:
+        data = codec.encode_list(ParameterList(self._parameters.revision, whole, [*infos]))
+        if len(data) > CONTENT_MAX:
+            nodes = ", ".join(dict.fromkeys(each.node for each in infos))
+            raise ParameterError(f"{len(infos)} parameters are too many for one answer: ask for one node of {nodes}")
+        return data
+
+    @contextlib.contextmanager
+    def _counts_refusals(self, operation: Operation) -> Iterator[None]:
+        try:
+            yield
+        except Error:
+            self._refused[operation.name] = self._refused.get(operation.name, 0) + 1
+            raise
 
     def _stage(self, argument: bytes) -> bytes:
+        with self._counts_refusals(Operation.PARAMETER_STAGE):
+            return self._add_to_stage(argument)
+
+    def _add_to_stage(self, argument: bytes) -> bytes:
         number, offset, data = codec.decode_part(argument)
         self._forget_old()
         if not number:
@@ -89,6 +117,10 @@ class ParameterServices:
         return codec.encode_count(number)
 
     def _commit(self, argument: bytes) -> bytes:
+        with self._counts_refusals(Operation.PARAMETER_COMMIT):
+            return self._commit_stage(argument)
+
+    def _commit_stage(self, argument: bytes) -> bytes:
         number, size, _ = codec.decode_part(argument)
         self._forget_old()
         stage = self._find(number)
@@ -100,10 +132,12 @@ class ParameterServices:
         return codec.encode_count(self._parameters.revision)
 
     async def _save(self, _argument: bytes) -> bytes:
-        return codec.encode_count(await self._parameters.save())
+        with self._counts_refusals(Operation.PARAMETER_SAVE):
+            return codec.encode_count(await self._parameters.save())
 
     def _reset(self, argument: bytes) -> bytes:
-        return codec.encode_count(self._parameters.reset(_node(argument)))
+        with self._counts_refusals(Operation.PARAMETER_RESET):
+            return codec.encode_count(self._parameters.reset(_node(argument)))
 
     def _find(self, number: int) -> _StagedSet:
         stage = self._stages.get(number)
@@ -149,22 +183,22 @@ async def change(ask: Ask, module: str, values: Mapping[Name, object]) -> None:
     for offset in range(0, len(data), _PART_MAX):
         part = codec.encode_part(stage, offset, data[offset : offset + _PART_MAX])
         try:
-            stage = codec.decode_count(await _asked(ask, Operation.PARAMETER_STAGE, part))
+            stage = await _number_asked(ask, module, Operation.PARAMETER_STAGE, part)
         except TimeoutError as error:
             raise TimeoutError(f"{str(error).partition(';')[0]}: nothing was set") from None
     if stage:
         await _asked(ask, Operation.PARAMETER_COMMIT, codec.encode_part(stage, len(data)))
 
 
-async def save(ask: Ask) -> int:
+async def save(ask: Ask, module: str) -> int:
     """Have a module save its parameters. Raises ParameterError with its text."""
-    return codec.decode_count(await _asked(ask, Operation.PARAMETER_SAVE, b""))
+    return await _number_asked(ask, module, Operation.PARAMETER_SAVE, b"")
 
 
 async def reset(ask: Ask, module: str, node: str | None, names: Iterable[str] | None) -> int:
     """Reset parameters of a module; return how many. Raises ParameterError with its text."""
     if names is None:
-        return codec.decode_count(await _asked(ask, Operation.PARAMETER_RESET, (node or "").encode()))
+        return await _number_asked(ask, module, Operation.PARAMETER_RESET, (node or "").encode())
     if node is None:
         raise ParameterError("reset with names= needs their node=, too")
     chosen = dict.fromkeys((node, name) for name in names)
@@ -212,9 +246,21 @@ async def _asked(ask: Ask, operation: Operation, argument: bytes) -> bytes:
         raise ParameterError(str(error)) from None
 
 
+async def _number_asked(ask: Ask, module: str, operation: Operation, argument: bytes) -> int:
+    content = await _asked(ask, operation, argument)
+    with _readable(module):
+        return codec.decode_count(content)
+
+
 def _decoded(module: str, content: bytes) -> ParameterList:
-    try:
+    with _readable(module):
         return codec.decode_list(content)
+
+
+@contextlib.contextmanager
+def _readable(module: str) -> Iterator[None]:
+    try:
+        yield
     except DecodeError as error:
         raise Error(f"the answer of {module} is not what this version of r2p can read: {error}") from error
 

@@ -15,6 +15,7 @@ fsync the directory.
 
 import asyncio
 import contextlib
+import errno
 import os
 import stat
 from collections.abc import Callable, Iterator, Mapping
@@ -29,6 +30,9 @@ T = TypeVar("T")
 
 FORMAT = 1
 """The number of the format, which the file begins with."""
+
+_UNSUPPORTED = (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.ENOTSUP)
+"""What network file systems answer that neither lock nor flush a directory: a save without is better than none."""
 
 _LOCK_TRIES = 40
 _LOCK_PAUSE = 0.05  # seconds between two tries, when another process saves to the directory
@@ -125,7 +129,11 @@ def _locked(directory: Path) -> Iterator[int]:
 
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in _UNSUPPORTED:
+                raise
         yield descriptor
     finally:
         os.close(descriptor)
@@ -152,7 +160,11 @@ def _write(directory: int, target: Path, text: str) -> None:
         with contextlib.suppress(OSError):
             os.unlink(temporary, dir_fd=directory)
         raise
-    os.fsync(directory)
+    try:
+        os.fsync(directory)
+    except OSError as error:
+        if error.errno not in _UNSUPPORTED:
+            raise
 
 
 def _keep_owner(descriptor: int, target: Path) -> None:

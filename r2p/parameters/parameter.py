@@ -34,7 +34,7 @@ class Parameter(Generic[T]):
     """A parameter of a node. Made by `Node.parameter`.
 
     `value` is what counts now. It changes when the program calls `set`, and when another module sets or resets it;
-    `changes()` and the `on_change` of `Node.parameter` tell of it.
+    `changes()` and the `on_change` of `Node.parameter` report it.
     """
 
     if TYPE_CHECKING:  # it is a slot, which costs less to read, and which only the registry writes

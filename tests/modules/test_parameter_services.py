@@ -158,7 +158,7 @@ async def test_a_set_of_many_values_is_sent_in_parts_and_made_once() -> None:
 
 @pytest.mark.virtual_time
 async def test_errors_name_what_is_wrong() -> None:
-    async with two(MemoryNetwork()) as (_, b):
+    async with two(MemoryNetwork()) as (a, b):
         network = b.network
         cases: list[tuple[dict[tuple[str, str], object], str]] = [
             ({("speed", "stepz"): 1}, r"A/speed has no parameter stepz; did you mean steps\?"),
@@ -176,6 +176,7 @@ async def test_errors_name_what_is_wrong() -> None:
             with pytest.raises(r2p.ParameterError, match=text):
                 await network.set_parameters("A", {("speed", "steps"): 7} | values)
         assert {each.origin for each in await network.parameters("A")} == {"code"}
+        assert a.refused == {"PARAMETER_COMMIT": len(cases) - 3}  # the other values were not sent
         with pytest.raises(r2p.ParameterError, match="A has no node wheel with parameters"):
             await network.parameters("A", "wheel")
         with pytest.raises(r2p.ParameterError, match="A has no file for parameters"):
@@ -188,6 +189,34 @@ async def test_errors_name_what_is_wrong() -> None:
             await anext(network.watch_parameters("C"))
         with pytest.raises(r2p.MessageError, match="the period of watch_parameters"):
             network.watch_parameters("A", period=0)
+
+
+@pytest.mark.virtual_time
+async def test_answers_of_a_module_that_makes_no_sense_are_errors() -> None:
+    async with two(MemoryNetwork()) as (a, b):
+        for answer in (b"", bytes(3), b"\2"):
+            for operation in Operation:
+                services(a).serve(operation, lambda _argument, answer=answer: answer)  # type: ignore[misc]
+            for asking in (
+                b.network.parameters("A"),
+                b.network.set_parameters("A", {("speed", "kp"): 1.0}),
+                b.network.save_parameters("A"),
+                b.network.reset_parameters("A"),
+                anext(b.network.watch_parameters("A")),
+            ):
+                with pytest.raises(r2p.Error, match="the answer of A is not what this version of r2p can read"):
+                    await asking
+
+
+@pytest.mark.virtual_time
+async def test_too_many_parameters_for_one_answer_are_listed_node_by_node() -> None:
+    async with r2p.Module("A") as a, node_in(a, name="one") as one, node_in(a, name="two") as two_:
+        for node in (one, two_):
+            for number in range(400):
+                node.parameter(f"p{number}_{'x' * 50}", "y" * 100, doc="z" * 120)
+        with pytest.raises(r2p.ParameterError, match=r"800 parameters are too many .* one node of one, two"):
+            await a.network.parameters("A")
+        assert len(await a.network.parameters("A", "two")) == 400
 
 
 @pytest.mark.virtual_time
