@@ -22,6 +22,7 @@ def seconds(function: Callable[[], object], number: int = NUMBER) -> float:
 def rows() -> Iterator[Row]:
     yield from _messages()
     yield from _scans()
+    yield from _cdr()
     yield from _lines()
 
 
@@ -66,6 +67,32 @@ def _scans() -> Iterator[Row]:
         f"rosbags {packed[1] * 1e6:.2f} + {unpacked[1] * 1e6:.2f} us: {base / ours:.1f}x",
         "5x",
         base >= 5 * ours,
+    )
+
+
+def _cdr() -> Iterator[Row]:
+    """A message in ROS 2's serialisation, against rosbags."""
+    from rosbags.typesys import Stores, get_typestore
+
+    from r2p.ros.cdr import cdr
+    from r2p.ros.classes import RosTypes
+    from r2p.ros.library import definitions_of_ros
+
+    imu = RosTypes(2, definitions_of_ros("sensor_msgs/Imu", 2)).load("sensor_msgs/Imu")
+    store, name = get_typestore(Stores.LATEST), "sensor_msgs/msg/Imu"
+    codec = cdr(imu)
+    data = codec.encode(imu(header=Header(frame_id="imu_link")))
+    message, theirs = codec.decode(data), store.deserialize_cdr(data, name)
+    assert bytes(store.serialize_cdr(theirs, name)) == data
+    packed = seconds(lambda: codec.encode(message)), seconds(lambda: store.serialize_cdr(theirs, name), NUMBER // 5)
+    unpacked = seconds(lambda: codec.decode(data)), seconds(lambda: store.deserialize_cdr(data, name), NUMBER // 5)
+    ours, base = (sum(pair) for pair in zip(packed, unpacked, strict=True))
+    yield Row(
+        "encode + decode of an Imu for ROS 2 (CDR)",
+        f"{packed[0] * 1e6:.2f} + {unpacked[0] * 1e6:.2f} us",
+        f"rosbags {packed[1] * 1e6:.2f} + {unpacked[1] * 1e6:.2f} us: {base / ours:.1f}x",
+        "4x",
+        base >= 4 * ours,
     )
 
 

@@ -25,7 +25,7 @@ GROUPS = {
     "node": ("r2p.tools.node", "List and inspect nodes."),
     "param": ("r2p.tools.param", "List, get, set and save parameters of nodes."),
     "module": ("r2p.tools.module", "List, stop and restart modules."),
-    "msg": ("r2p.tools.msg", "Show message types, and export them to C."),
+    "msg": ("r2p.tools.msg", "Show message types, and exchange them with C and ROS."),
     "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots."),
     "key": ("r2p.tools.key", "Make a shared key for links."),
     "config": ("r2p.tools.config_show", "Show the settings, and where they come from."),

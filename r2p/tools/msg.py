@@ -15,7 +15,7 @@ from r2p.tools.output import Output, notify
 from r2p.tools.session import UsageError, group, settings, standalone
 from r2p.tools.types import Types, class_path, put_sizes, size_text, standard_types, type_name
 
-app = group("Show message types, export them to C and ROS, and import those of ROS.")
+app = group("Show message types, and exchange them with C and ROS.")
 
 _BOUND = 1000  # of texts and arrays of ROS that have none: small enough for most links
 
