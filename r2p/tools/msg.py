@@ -143,8 +143,9 @@ async def import_(
         ),
     ] = _BOUND,
 ) -> None:
-    """Print a type of ROS as Python classes for r2p, with the bytes of ROS 1.
+    """Print a type of ROS as Python classes for r2p.
 
+    They have the bytes of ROS 1.
     Types that r2p.msg has are imported from there. Nested types are looked for beside the package of a file, then among
     those that come with ROS (pip install 'r2p[ros]').
     """
