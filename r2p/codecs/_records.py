@@ -19,16 +19,25 @@ T = TypeVar("T", bound=msgspec.Struct)
 class Record(Generic[T]):
     """The wire format of one struct, little-endian and without gaps: `Record(Alive, ManagementType.ALIVE, "7s x B")`.
 
-    `version` is the body's first byte, for types that have one. `may_be_empty` lists the names that may be empty.
+    `version` is the body's first byte, for types that have one. `may_be_empty` lists the names that may be empty, and
+    `may_be_damaged` those with any characters: one that is not printable ASCII is decoded as `?`.
     """
 
     def __init__(
-        self, cls: type[T], code: int, kinds: str, *, version: int | None = None, may_be_empty: tuple[str, ...] = ()
+        self,
+        cls: type[T],
+        code: int,
+        kinds: str,
+        *,
+        version: int | None = None,
+        may_be_empty: tuple[str, ...] = (),
+        may_be_damaged: tuple[str, ...] = (),
     ) -> None:
         self.cls = cls
         self.code = code
         self.version = version
         self._may_be_empty = may_be_empty
+        self._may_be_damaged = may_be_damaged
         self._format = struct.Struct("<" + kinds)
         formats = [kind for kind in kinds.split() if kind != "x"]
         fields = zip(msgspec.structs.fields(cls), formats, strict=True)
@@ -59,6 +68,8 @@ class Record(Generic[T]):
 
     def _name(self, name: str, field: bytes) -> str:
         text = field.partition(b"\0")[0].decode("latin-1")
+        if name in self._may_be_damaged:
+            text = "".join(each if _is_plain(each) else "?" for each in text)
         if not (text or name in self._may_be_empty) or not _is_plain(text):
             raise DecodeError(f"{self.cls.__name__}.{name}: {text!r} is not a valid name")
         return text

@@ -60,7 +60,10 @@ class EndLoader(Loader):
 
 
 class LinkingSetup(Loader):
-    """The lengths of an app's sections and stack, its name (8 characters), and FLAG_ENABLED or 0."""
+    """The lengths of an app's sections and stack, its name (8 characters), and FLAG_ENABLED or 0.
+
+    A name that the module's flash does not hold whole, after a power cut, has `?` in place of what is not printable.
+    """
 
     pgmlen: int
     bsslen: int
@@ -169,7 +172,7 @@ _CODEC = Codec[Loader](
     Record(Ack, 1, ""),
     Record(BeginLoader, 2, ""),
     Record(EndLoader, 3, ""),
-    Record(LinkingSetup, 4, "I I I I 8s H", may_be_empty=("name",)),
+    Record(LinkingSetup, 4, "I I I I 8s H", may_be_empty=("name",), may_be_damaged=("name",)),
     Record(LinkingAddresses, 5, "I I I I I I"),
     Record(LinkingOutcome, 6, "I I I I I I I"),
     Record(IhexRecord, 7, "B H B 16s B"),

@@ -78,6 +78,12 @@ def test_a_nack_that_firmware_never_filled() -> None:
     assert loader.encode(message) == data
 
 
+def test_a_name_that_was_cut_by_a_power_cut_is_shown_as_far_as_it_goes() -> None:
+    """An app must be seen to be removed."""
+    data = bytes(16) + b"AP\xff\x07P" + bytes(9) + b"\x04"
+    assert loader.decode(data) == loader.LinkingSetup(0, 0, 0, 0, "AP??P")
+
+
 @pytest.mark.golden
 def test_recorded_damage() -> None:
     (unknown,) = (data for case in cases(name="boot_mode_start") for data, _ in recorded(case) if data[-1] == 0x63)

@@ -10,7 +10,8 @@ It answers as the recorded one, with the same numbers of source lines in a refus
 - Its queue holds 4 messages, and it looks at it every 10 ms; any more are lost without an answer.
 - A length that wraps the address of the next app makes the list of apps endless: the module hangs.
 
-It differs from firmware in one point: a name with characters that are not printable makes its message an unknown one.
+It differs from firmware in one point: a character that is not printable counts as `?` in the name of an app to load,
+and makes a request of its parameters unknown.
 """
 
 from collections import Counter, deque

@@ -178,7 +178,7 @@ def test_a_power_cut_at_any_step_of_a_load_leaves_the_app_or_not(late: int) -> N
         peer.send(message)
         peer.wait(late)
         peer.power_on()
-        found = [app.name for app in peer.module.loader.apps]
+        found = peer.apps()
         if isinstance(message, EndLoader):  # at 25 ms its entry is half written
             assert found == {0: ["OLD"], 10: ["OLD"], 25: ["OLD", "????????"]}.get(late, ["OLD", "NEW"])
             peer.run(acknowledged(BeginLoader(), RemoveAll(), EndLoader()), ms=4000)
