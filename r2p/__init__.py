@@ -54,6 +54,8 @@ from r2p.messages import (
 )
 from r2p.modules.graph import Endpoint, ModuleView, NetworkView, TopicView
 from r2p.modules.module import Module
+from r2p.modules.node_messages import NodeInfo, NodeList
+from r2p.modules.remote_nodes import RemoteNodes, RemoteSwap
 from r2p.modules.runner import run, run_main
 from r2p.modules.statistics import (
     ForwardedTopic,
@@ -127,6 +129,8 @@ __all__ = [
     "Node",
     "NodeCrashed",
     "NodeFunction",
+    "NodeInfo",
+    "NodeList",
     "NodeStatistics",
     "NonRealTime",
     "Parameter",
@@ -139,6 +143,8 @@ __all__ = [
     "PublisherClass",
     "PublisherStatistics",
     "ReasonCount",
+    "RemoteNodes",
+    "RemoteSwap",
     "RouteStatistics",
     "Sample",
     "Service",

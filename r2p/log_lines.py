@@ -150,16 +150,18 @@ def node_logger(module: str, node: str) -> logging.Logger:
 
 
 class NodeLogger(logging.LoggerAdapter[logging.Logger]):
-    """A logger named `r2p.MODULE.NODE`; its records from INFO up also go to the module's `log` topic."""
+    """A logger named `r2p.MODULE.NODE`; its records from `threshold` up also go to the module's `log` topic."""
 
     def __init__(self, logger: logging.Logger, publish: Callable[[int, str], None]) -> None:
         super().__init__(logger)
+        self.threshold = logging.INFO
+        """The level from which on records go to the topic."""
         self._publish = publish
 
     def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
         kwargs["stacklevel"] = kwargs.get("stacklevel", 1) + 1
         super().log(level, msg, *args, **kwargs)
-        if level >= logging.INFO:
+        if level >= self.threshold:
             self._publish(level, _text(level, msg, args, kwargs.get("exc_info")))
 
 

@@ -58,10 +58,14 @@ class Operation(enum.IntEnum):
     STATISTICS = 2
     PARAMETERS = 3
     PARAMETER_CHANGES = 4
+    NODES = 5
     PARAMETER_STAGE = 128
     PARAMETER_COMMIT = 129
     PARAMETER_SAVE = 130
     PARAMETER_RESET = 131
+    NODE_COMMAND = 136
+    NODE_CODE = 137
+    LOG_LEVEL = 138
 
     @property
     def changes(self) -> bool:

@@ -19,6 +19,7 @@ from r2p.messages import Layout, Message
 from r2p.modules import parameter_services
 from r2p.modules.link_manager import LinkManager
 from r2p.modules.own_services import unknown_operation
+from r2p.modules.remote_nodes import RemoteNodes
 from r2p.modules.statistics import ModuleStatistics, decode
 from r2p.modules.type_lookup import find_type
 from r2p.parameters.definition import ParameterInfo
@@ -162,6 +163,10 @@ class NetworkView:
                 raise
             text = f"{module} has r2p {view.release or 'of an earlier version'}, which knows no {what}: update it there"
             raise Error(text) from None
+
+    def nodes_of(self, module: str) -> RemoteNodes:
+        """Return the nodes of a module, this one or any r2p module, to list, start, stop, restart and swap them."""
+        return RemoteNodes(self.ask, module)
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
         """Ask the modules on the network for a message class of this layout; None without an answer.

@@ -8,12 +8,11 @@ with` block ends.
 """
 
 import asyncio
-import contextlib
 import logging
 import os
 import socket
-import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -23,24 +22,22 @@ from r2p.codecs.management import FLAG_REBOOTED, FLAG_STOPPED
 from r2p.codecs.own_services import Operation
 from r2p.errors import Closed, Error, NodeCrashed, ParameterError
 from r2p.log_lines import LineLimit, get_logger
-from r2p.messages import Timestamp
+from r2p.modules.code import CodeLoader
 from r2p.modules.graph import NetworkView
 from r2p.modules.link_manager import LinkManager
+from r2p.modules.log_topic import LogLevels, LogTopic
+from r2p.modules.node_control import NodeControl
 from r2p.modules.nodes import NodeTable
 from r2p.modules.parameter_services import ParameterServices
 from r2p.modules.statistics import ModuleStatistics, collect, encode
 from r2p.modules.supervisor import NodeFunction, NodeOptions, Supervisor
 from r2p.modules.swap import SwapLimits, SwapResult
 from r2p.modules.watchdog import Watchdog, watch
-from r2p.msg import Log
 from r2p.names import (
-    LOG,
     check_aliases,
-    module_alias,
     module_name,
     module_name_from,
     module_path,
-    node_alias,
     topic_name,
 )
 from r2p.parameters.file import ParameterFile
@@ -57,12 +54,8 @@ from r2p.units import SECOND
 
 logger = get_logger("r2p.module")
 
-LOG_RATE = 50
-"""Records a second on the topic `log`, and records that may come at once: an eighth of a CAN bus of 1 Mbit/s."""
-
 _DECLARED_AFTER = 2 * SECOND  # ns after which nodes have declared their parameters
 _COMMAND_LINES = 1  # of the log in a second about one kind of command
-_LOG_TEXT_MAX = 128  # characters of `Log.text`
 
 
 class Module:
@@ -80,6 +73,9 @@ class Module:
 
     `allow_control` lets other modules change this one, such as its parameters, also by IP links without a key: `tcp:`,
     `tcp-listen:` and `zenoh:`.
+
+    `allow_load` lets other modules start, end and swap its nodes, from files in this directory (True: the working
+    directory) and, by links with a key, with code that they send; `wait` then goes on without nodes.
 
     With `bridge` the module is a gateway: it joins its links, and forwards on each network what the gateways there have
     agreed on. BridgeOptions restrict that.
@@ -101,6 +97,7 @@ class Module:
         watchdog: bool = True,
         bridge: bool | BridgeOptions = False,
         allow_control: bool = False,
+        allow_load: bool | str | os.PathLike[str] = False,
         params_file: str | os.PathLike[str] | None = None,
         params: GivenParameters = None,
     ) -> None:
@@ -126,7 +123,10 @@ class Module:
         self._with_watchdog = watchdog
         self._bridge_options = BridgeOptions() if bridge is True else bridge or None
         self._allow_control = allow_control
+        self._log_levels = LogLevels()
         self._nodes = NodeTable(self.name, self._make_node, self.parameters.node_gone)
+        self._loader = CodeLoader(Path() if allow_load is True else Path(allow_load)) if allow_load else None
+        self._node_control = NodeControl(self.name, self._nodes, self._log_levels, self._loader)
         self._events = EventHub()
         self._link_manager: LinkManager | None = None
         self._transports: list[asyncio.Task[None]] = []
@@ -155,8 +155,8 @@ class Module:
             allow_control=self._allow_control,
         )
         self._opened.own_services.serve(Operation.STATISTICS, lambda _argument: encode(self.statistics()))
+        self._node_control.serve(self._opened.own_services, clock, self._check_startable)
         ParameterServices(self.parameters, self._opened.own_services, clock, self._opened.random, self.refused)
-        self._changed = asyncio.Event()
         self._switching = asyncio.Lock()
         self._log = None if self.observer else LogTopic(self.space, self._remap)
         self._watchdog: Watchdog | None = None
@@ -284,6 +284,7 @@ class Module:
             # While the links are up: clean-up publishes what stops the motors.
             await self._nodes.end_all("the module was closed")
         finally:
+            self._log_levels.close()
             if self._log is not None:
                 self._log.close()
             for transport in self._transports:
@@ -330,7 +331,7 @@ class Module:
     def _make_node(self, name: str, options: NodeOptions) -> Node:
         log = self._log.publish if self._log is not None else no_log
         names = self._remap | options.remap
-        return Node(
+        node = Node(
             name,
             self.space,
             priority=options.priority,
@@ -339,6 +340,8 @@ class Module:
             events=self._events,
             parameters=self.parameters,
         )
+        self._log_levels.apply(node)
+        return node
 
     async def swap(
         self,
@@ -384,7 +387,10 @@ class Module:
         return dict(self._nodes.supervisors)
 
     async def wait(self) -> None:
-        """Wait until all nodes have ended by themselves (not by STOP: a stopped module waits for REBOOT)."""
+        """Wait until all nodes have ended by themselves.
+
+        A module that was stopped waits for REBOOT, and one with `allow_load` for its end.
+        """
         while self._open and (self._held or self._nodes.running):
             self._nodes.changed.clear()
             await self._nodes.changed.wait()
@@ -435,7 +441,7 @@ class Module:
     @property
     def _held(self) -> bool:
         """Return whether ended nodes will start again, or may."""
-        return self.stopped or self._switching.locked()
+        return self.stopped or self._loader is not None or self._switching.locked()
 
     # Network
 
@@ -470,55 +476,6 @@ def _urls(via: str | Transport | Iterable[str | Transport] | None) -> list[str |
 
 def _checked_remap(remap: dict[str, str] | None) -> dict[str, str]:
     return {topic_name(old): topic_name(new) for old, new in (remap or {}).items()}
-
-
-class LogTopic:
-    """Publishes log records; those beyond the rate are counted in `suppressed`, and the next record says how many."""
-
-    def __init__(self, space: TopicSpace, remap: dict[str, str]) -> None:
-        self.suppressed = 0
-        self._space = space
-        self._thread = threading.get_ident()
-        self._node = Node(LOG, space, remap=remap)
-        self._publisher = self._node.advertise(LOG, Log)
-        self._credit = float(LOG_RATE)
-        self._credited_at = space.clock.monotonic()
-
-    def publish(self, level: int, node: str, text: str) -> None:
-        """Publish each line as a record, from any thread; never waits, and never fails."""
-        if threading.get_ident() != self._thread:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
-                self._space.loop.call_soon_threadsafe(self.publish, level, node, text)
-            return
-        for line in text.splitlines():
-            self._publish_line(level, node, line)
-
-    def close(self) -> None:
-        """Stop publishing."""
-        self._node.close()
-
-    def _publish_line(self, level: int, node: str, line: str) -> None:
-        if self._node.closed or not self._within_rate():
-            self.suppressed += 1
-            return
-        if self.suppressed:
-            line = f"({self.suppressed} suppressed) {line}"
-            self.suppressed = 0
-        text = line.encode("ascii", "replace").replace(b"\0", b"?")[:_LOG_TEXT_MAX].decode()  # as firmware reads it
-        stamp = Timestamp.from_ns(self._space.clock.now())
-        level = min(max(level, 0), 255)
-        module = module_alias(self._space.module)
-        record = Log(stamp=stamp, level=level, module=module, node=node_alias(node), text=text)
-        self._publisher.publish_nowait(record)
-
-    def _within_rate(self) -> bool:
-        now = self._space.clock.monotonic()
-        self._credit = min(float(LOG_RATE), self._credit + (now - self._credited_at) * LOG_RATE / SECOND)
-        self._credited_at = now
-        if self._credit < 1.0:
-            return False
-        self._credit -= 1.0
-        return True
 
 
 class CommandHandler:

@@ -44,6 +44,7 @@ def run(
     aliases: dict[str, str] | None = None,
     restart: bool = False,
     allow_control: bool = False,
+    allow_load: bool | str | os.PathLike[str] = False,
     params_file: str | os.PathLike[str] | None = None,
     params: GivenParameters = None,
 ) -> None:
@@ -51,7 +52,7 @@ def run(
 
     A node has the name of its function, or another: `run(line_follower, name="follower")`, and of several
     `run(blink, ("follower", line_follower))`. `module` is the module's name; `via`, `remap`, `aliases`,
-    `allow_control`, `params_file` and `params` are as for `Module`, `restart` as for `Module.start`.
+    `allow_control`, `allow_load`, `params_file` and `params` are as for `Module`, `restart` as for `Module.start`.
 
     Meanwhile logging writes to stderr, unless the root logger or the logger `r2p` has handlers: `r2p` from INFO up, all
     other loggers from WARNING up.
@@ -68,6 +69,7 @@ def run(
             remap=remap,
             aliases=aliases,
             allow_control=allow_control,
+            allow_load=allow_load,
             params_file=params_file,
             params=params,
         )

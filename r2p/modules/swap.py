@@ -39,7 +39,7 @@ CLEANUP = 5.0
 
 _TRIAL = 0.05  # seconds that a new node runs before it takes over, at least: many crash at once
 _SUBSCRIBE = 0.5  # seconds for which a swap waits for subscriptions of the old node that the new one lacks
-_FIRST = 1.0  # seconds for which it waits for the first message on each topic, or two periods
+_FIRST = 0.5  # seconds for which it waits for the first message on each topic, or two periods
 _POLL = 0.005  # seconds
 
 
@@ -47,7 +47,7 @@ class TopicPause(msgspec.Struct, frozen=True):
     """The pause in a topic of both nodes, in seconds: of a periodic publisher, from the old node's last message to the
     first one of the new node, which is one `period` if none is missing; of others, from the end of the old node.
 
-    `pause` is None if the new node has published nothing within a second.
+    `pause` is None if the new node has published nothing within half a second, or two periods.
     """
 
     topic: str

@@ -16,6 +16,7 @@ import r2p
 from r2p.msg import Log
 from r2p.names import LOG
 from r2p.tools.completion import complete_node_or_module
+from r2p.tools.log_levels import set_levels
 from r2p.tools.options import Count, Format, Once, Timeout
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, joined, patience
@@ -57,6 +58,14 @@ async def log(
         ),
     ] = None,
     *,
+    set: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NODE=LEVEL",
+            help="Set from which level on NODE, MODULE/NODE or MODULE/* logs, and end; default: as at its start.",
+        ),
+    ] = None,
     level: Annotated[Level, typer.Option("--level", "-l", help="Only records of this level and above.")] = Level.INFO,
     follow: Annotated[
         bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C: the default, as there are no old records.")
@@ -68,8 +77,12 @@ async def log(
 ) -> None:
     """Print the log records of all modules as they arrive: time, level, module/node, text.
 
-    Modules publish their records from INFO up, and nothing keeps old ones. Ctrl-C ends it.
+    Modules publish their records from INFO up, or from the level that was set by --set, until they end. Nothing keeps
+    old ones. Ctrl-C ends it.
     """
+    if set:
+        await set_levels(session, set)
+        return
     await _Printer(session, Output(format), node or "", level).run(1 if once else count, timeout)
 
 

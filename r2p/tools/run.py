@@ -44,13 +44,13 @@ class Program(msgspec.Struct, frozen=True):
 @service
 async def command(
     functions: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
             metavar="FILE:FUNCTION[=NAME]",
             help="blink.py:blink, blink.py:blink=left, or package.module:function.",
             show_default=False,
         ),
-    ],
+    ] = None,
     module: Annotated[
         str | None, typer.Option(metavar="NAME", help="The module's name; default: from r2p.toml or the host name.")
     ] = None,
@@ -70,16 +70,25 @@ async def command(
     params_file: ParamsFile = None,
     params: Params = None,
     param: Param = None,
+    allow_load: Annotated[
+        Path | None,
+        typer.Option(
+            "--allow-load", metavar="DIR", help="Let r2p node start, end and swap nodes here, with code in DIR."
+        ),
+    ] = None,
     via: Via = None,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended, or Ctrl-C.
 
-    A crash ends only that node; the command then exits with 1.
+    A crash ends only that node; the command then exits with 1. With --allow-load it runs until Ctrl-C, also without
+    functions: nodes may be started later.
     """
+    if not functions and allow_load is None:
+        raise UsageError("which function? r2p run blink.py:blink; with --allow-load DIR, nodes can be started later")
     chosen = settings(via)
     check_urls(chosen.via, chosen.via_source)
     names = chosen.remap | _parse_remap(remap or ())
-    programs = load(functions)
+    programs = load(functions or ())
     priorities = _parse_priorities(priority or (), programs)
     name = module or chosen.module or module_name_from(socket.gethostname())
     async with r2p.Module(
@@ -90,10 +99,11 @@ async def command(
         allow_control=allow_control,
         params_file=params_file or chosen.params_file,
         params=parameter_sources(name, chosen, params or (), param or ()),
+        allow_load=allow_load or False,
     ) as host:
         for program in programs:
             host.start(program.function, name=program.name, priority=priorities.get(program.name, 0), restart=restart)
-        nodes = ", ".join(program.name for program in programs)
+        nodes = ", ".join(program.name for program in programs) or "no node yet (r2p node start)"
         links = ", ".join(chosen.via) or "none, local only (--via joins a network)"
         logger.info("module %s runs %s; links: %s; Ctrl-C ends it", host.name, nodes, links)
         await host.wait()

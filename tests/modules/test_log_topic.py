@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
-from r2p.modules.module import LOG_RATE
+from r2p.modules.log_topic import LOG_RATE
 from r2p.msg import Led, Log
 from r2p.runtime.topic import Topic
 from tests.bench import hold, led, local, settle

@@ -374,7 +374,7 @@ def motors() -> list[asyncio.Task[Any]]:
     return [task for task in asyncio.all_tasks() if task.get_name() == "PC1/motor"]
 
 
-@pytest.mark.parametrize("after", [0.0, 0.05, 0.099, 0.101, 0.15, 0.25, 0.5, 1.15])
+@pytest.mark.parametrize("after", [0.0, 0.05, 0.099, 0.101, 0.15, 0.25, 0.5, 0.65])
 @pytest.mark.parametrize("kill", [nothing, cancel, stop, reboot, end_node])
 async def test_a_swap_that_is_killed_at_any_step_leaves_one_node(
     after: float, kill: Callable[[r2p.Module, asyncio.Task[Any]], Awaitable[None]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 
 import pytest
 
@@ -35,12 +36,15 @@ async def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         rows = printed(capsys)
         await list_(session, all=True)
         everybody = printed(capsys)
+    unknown = dict.fromkeys(("state", "restarts", "age", "cpu"))
+    runs = {"state": "running", "restarts": 0, "age": 0.4, "cpu": None}
     assert rows == [
-        {"node": "BOT/drive", "publishes": ["encoder", "leds"], "subscribes": ["cmd"]},
-        {"node": "BOT/log", "publishes": ["log"], "subscribes": []},
-        {"node": "BOT/show", "publishes": [], "subscribes": ["leds"]},
+        {"node": "BOT/drive", **runs, "publishes": ["encoder", "leds"], "subscribes": ["cmd"]},
+        {"node": "BOT/log", **unknown, "publishes": ["log"], "subscribes": []},
+        {"node": "BOT/show", **runs, "publishes": [], "subscribes": ["leds"]},
     ]
-    assert everybody == [*rows, {"node": f"{other.module.name}/tool", "publishes": [], "subscribes": ["leds"]}]
+    tool_row = {"node": f"{other.module.name}/tool", **unknown, "publishes": [], "subscribes": ["leds"]}
+    assert [row | {"age": None} for row in everybody] == [row | {"age": None} for row in [*rows, tool_row]]
 
 
 async def test_what_firmware_has_is_listed_under_a_question_mark(capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,11 +52,12 @@ async def test_what_firmware_has_is_listed_under_a_question_mark(capsys: pytest.
         firmware = Firmware("IMU1")
         firmware.advertise("tilt", 4)
         await list_(session)
-        assert printed(capsys) == [{"node": "?/?", "publishes": ["tilt"], "subscribes": []}]
+        unknown = dict.fromkeys(("state", "restarts", "age", "cpu"))
+        assert printed(capsys) == [{"node": "?/?", **unknown, "publishes": ["tilt"], "subscribes": []}]
         firmware.alive()
         await list_(session)
         captured = capsys.readouterr()
-        assert captured.out == '{"node": "IMU1/?", "publishes": ["tilt"], "subscribes": []}\n'
+        assert json.loads(captured.out) == {"node": "IMU1/?", **unknown, "publishes": ["tilt"], "subscribes": []}
         assert "firmware announces one item every 0.5 s, so there may be more topics" in captured.err
 
 
@@ -61,11 +66,19 @@ async def test_info(capsys: pytest.CaptureFixture[str]) -> None:
         await info(session, "BOT/drive")
         await info(session, "drive")
     one, same = printed(capsys)
-    assert one == same
+    assert one | {"age": None} == same | {"age": None}
     assert one == {
         "node": "BOT/drive",
         "module": "running",
         "link": "memory:lab",
+        "state": "running",
+        "restarts": 0,
+        "age": 0.4,
+        "cpu": None,
+        "error": None,
+        "function": "test_node.py:drive",
+        "priority": 0,
+        "log_level": None,
         "publishes": [
             {"topic": "encoder", "type": "r2p_msgs/Encoder", "size": 4, "varies": False, "class": "periodic"},
             {"topic": "leds", "type": "r2p_msgs/Led", "size": 5, "varies": False, "class": "nrt"},

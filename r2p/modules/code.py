@@ -1,0 +1,241 @@
+"""Load the functions of nodes at run time: from files of one directory, or from code that another module has sent.
+
+A file is compiled anew each time. The modules that it imports from the directory are loaded again if they, or what they
+import from there, have changed; other modules of the program stay as they are. If anything fails, `sys.modules` is as
+before, and what runs goes on with the code that it has.
+"""
+
+import asyncio
+import contextlib
+import importlib
+import importlib.util
+import linecache
+import os
+import stat
+import sys
+import threading
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from r2p.clock import clock_of
+from r2p.errors import Error, InvalidName
+from r2p.log_lines import internal, short_traceback
+from r2p.modules.supervisor import NodeFunction, name_of
+
+CODE_MAX = 256 << 10
+"""Bytes of the longest file."""
+
+_TIMEOUT = 30.0  # seconds that the code of a file may run while it is loaded
+_PREFIX = "_r2p_"  # of the names of modules whose own name has another one already
+
+_Signature = tuple[int, int]
+
+
+class CodeLoader:
+    """Loads functions from the files of one directory, and from code that was sent."""
+
+    def __init__(self, directory: Path) -> None:
+        """Raises Error if there is no such directory."""
+        self.directory = directory.resolve()
+        if not self.directory.is_dir():
+            raise Error(f"allow_load: there is no directory {directory}")
+        self._known = {name: _signature(path) for name, path in self._own_modules()}
+        """The state of the files of loaded modules, when they were loaded."""
+        self._loading = asyncio.Lock()
+
+    async def load(self, file: str, function: str) -> NodeFunction:
+        """Return a function of a file, whose path is relative to the directory, or absolute.
+
+        Raises Error for a path that does not lead to a file in the directory, and with the traceback of what is wrong
+        in the file.
+        """
+        path = self._path(file)
+        source = _read(path)
+        return await self._load(file, function, lambda: self._run_file(path, source))
+
+    async def load_sent(self, name: str, code: bytes, function: str) -> NodeFunction:
+        """Return a function of code that was sent, as a file of this name. It is kept in memory only. Raises Error."""
+        return await self._load(name, function, lambda: _run_sent(name, code))
+
+    def _path(self, file: str) -> Path:
+        try:
+            path = (self.directory / file).resolve()
+            found = path.is_file()
+        except (OSError, ValueError, RuntimeError):  # a loop of links, a null byte
+            raise Error(f"{file!r} is not a path") from None
+        if not path.is_relative_to(self.directory):
+            raise Error(f"{file} is not in {self.directory}, and no other code may be loaded (--allow-load DIR)")
+        if not found:
+            raise Error(f"there is no file {file} in {self.directory}, on the computer of the module")
+        _check_owner(path)
+        if path.suffix != ".py":
+            raise Error(f"{file} is not a Python file: its name must end with .py")
+        return path
+
+    async def _load(self, file: str, function: str, run: Callable[[], types.ModuleType]) -> NodeFunction:
+        """Run code, in a thread, as imports may take long, and return a function of its module."""
+        async with self._loading:
+            with _unless_it_fails():
+                try:
+                    module = await _in_thread(run)
+                except TimeoutError:
+                    raise Error(f"{file} still runs {_TIMEOUT:g} s after its start: it has to end at once") from None
+                except BaseException as error:  # SystemExit as well: the user's code may raise anything
+                    if isinstance(error, asyncio.CancelledError | KeyboardInterrupt):
+                        raise
+                    raise Error(f"can't load {file}:\n{_traceback(error)}") from None
+                found = _function(file, module, function)
+        self._known = {name: _signature(path) for name, path in self._own_modules()}
+        return found
+
+    def _run_file(self, path: Path, source: bytes) -> types.ModuleType:
+        self._forget_changed()
+        if str(path.parent) not in sys.path:
+            sys.path.insert(0, str(path.parent))
+        # A file named json.py must not replace the module that others have imported.
+        known = sys.modules.get(path.stem)
+        own = known is None or getattr(known, "__file__", None) == str(path)
+        name = path.stem if own else f"{_PREFIX}{path.stem}"
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None
+        return _run(importlib.util.module_from_spec(spec), source, str(path))
+
+    def _forget_changed(self) -> None:
+        """Forget the modules of the directory whose files have changed, and those that have anything of them."""
+        own = dict(self._own_modules())
+        changed = {name for name, path in own.items() if self._known.get(name) != _signature(path)}
+        while more := {name for name in own.keys() - changed if _uses(sys.modules[name], changed)}:
+            changed |= more
+        for name in changed:
+            cached = getattr(sys.modules.pop(name).__spec__, "cached", None)
+            if cached:  # Python compares times in seconds: a second change in one would not be seen
+                with contextlib.suppress(OSError):
+                    Path(cached).unlink(missing_ok=True)
+        importlib.invalidate_caches()
+
+    def _own_modules(self) -> Iterator[tuple[str, Path]]:
+        """Return the names of all loaded modules whose files are in the directory, with these."""
+        for name, module in list(sys.modules.items()):
+            file = getattr(module, "__file__", None)
+            if name != "__main__" and isinstance(file, str) and Path(file).is_relative_to(self.directory):
+                yield name, Path(file)
+
+
+def _uses(module: types.ModuleType, names: set[str]) -> bool:
+    return any(
+        (value.__name__ if isinstance(value, types.ModuleType) else getattr(value, "__module__", None)) in names
+        for value in list(vars(module).values())
+    )
+
+
+def _signature(path: Path) -> _Signature | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+def _check_owner(path: Path) -> None:
+    """Raise Error for a file that another user than this one and root has written, or everyone can write."""
+    status = path.stat()
+    if status.st_uid not in {0, os.geteuid()} or status.st_mode & stat.S_IWOTH:
+        raise Error(f"{path} belongs to another user, or everyone can write it: chown it, and chmod o-w")
+
+
+def _read(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            source = file.read(CODE_MAX + 1)
+    except OSError as error:
+        raise Error(f"can't read {path}: {error.strerror}") from None
+    if len(source) > CODE_MAX:
+        raise Error(f"{path} has more than {CODE_MAX >> 10} KiB: import its larger parts from other files")
+    return source
+
+
+def _run_sent(name: str, code: bytes) -> types.ModuleType:
+    filename = f"<sent {name}>"
+    lines = code.decode(errors="replace").splitlines(keepends=True)
+    linecache.cache[filename] = len(code), None, lines, filename  # tracebacks quote it
+    stem = "".join(each if each.isalnum() else "_" for each in name.removesuffix(".py"))
+    module = types.ModuleType(f"{_PREFIX}sent_{stem}")
+    module.__file__ = filename
+    return _run(module, code, filename)
+
+
+def _run(module: types.ModuleType, source: bytes, filename: str) -> types.ModuleType:
+    code = compile(source, filename, "exec", dont_inherit=True)
+    sys.modules[module.__name__] = module  # before it runs, as `import` does: its dataclasses look it up
+    exec(code, module.__dict__)  # noqa: S102 - what this file is for: see docs/security.md
+    linecache.checkcache(filename)
+    return module
+
+
+@contextlib.contextmanager
+def _unless_it_fails() -> Iterator[None]:
+    """Undo what the block does to `sys.modules` if it raises."""
+    before = dict(sys.modules)
+    try:
+        yield
+    except BaseException:
+        for name in sys.modules.keys() - before.keys():
+            if name.partition(".")[0] not in before:
+                sys.modules.pop(name, None)
+        sys.modules.update({name: module for name, module in before.items() if sys.modules.get(name) is not module})
+        raise
+
+
+def _traceback(error: BaseException) -> str:
+    """Format an error of the user's code from its first frame on: a wrong syntax has none."""
+    trace = error.__traceback__
+    while trace is not None and internal(trace.tb_frame.f_code.co_filename):
+        trace = trace.tb_next
+    return short_traceback(error.with_traceback(trace))
+
+
+def _function(file: str, module: types.ModuleType, name: str) -> NodeFunction:
+    function: NodeFunction | None = getattr(module, name, None)
+    if function is None:
+        names = ", ".join(
+            each
+            for each, value in vars(module).items()
+            if getattr(value, "__module__", None) == module.__name__ and asyncio.iscoroutinefunction(value)
+        )
+        raise Error(f"{file} has no function {name}; {f'it has {names}' if names else 'it defines no node'}")
+    with contextlib.suppress(InvalidName):  # the node may have another name
+        name_of(function)
+    return function
+
+
+async def _in_thread(run: Callable[[], types.ModuleType]) -> types.ModuleType:
+    """Run code in a thread of its own, which does not keep the process going; under virtual time, here.
+
+    Raises TimeoutError if it takes too long.
+    """
+    loop = asyncio.get_running_loop()
+    if clock_of(loop).virtual:
+        return run()
+    result: asyncio.Future[types.ModuleType] = loop.create_future()
+
+    def finish(module: types.ModuleType | None, error: BaseException | None) -> None:
+        if result.done():
+            return
+        if error is not None:
+            result.set_exception(error if not isinstance(error, StopIteration) else Error(repr(error)))
+        elif module is not None:
+            result.set_result(module)
+
+    def work() -> None:
+        module, error = None, None
+        try:
+            module = run()
+        except BaseException as raised:  # noqa: BLE001 - the user's code: it is raised again where it is awaited
+            error = raised
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            loop.call_soon_threadsafe(finish, module, error)
+
+    threading.Thread(target=work, name="r2p-load", daemon=True).start()
+    async with asyncio.timeout(_TIMEOUT):
+        return await result
