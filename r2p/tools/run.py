@@ -33,6 +33,23 @@ from r2p.tools.session import UsageError, check_urls, service, settings
 
 logger = logging.getLogger("r2p.runner")
 
+_Functions = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="FILE:FUNCTION[=NAME]",
+        help="blink.py:blink, blink.py:blink=left, or package.module:function.",
+        show_default=False,
+    ),
+]
+_Priority = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NODE=N", help="Nodes of higher priority get their messages first; default 0 (repeatable)."),
+]
+_AllowLoad = Annotated[
+    Path | None,
+    typer.Option("--allow-load", metavar="DIR", help="Let r2p node start, end and swap nodes here, with code in DIR."),
+]
+
 
 class Program(msgspec.Struct, frozen=True):
     """A function to run as a node of this name."""
@@ -43,26 +60,14 @@ class Program(msgspec.Struct, frozen=True):
 
 @service
 async def command(
-    functions: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="FILE:FUNCTION[=NAME]",
-            help="blink.py:blink, blink.py:blink=left, or package.module:function.",
-            show_default=False,
-        ),
-    ] = None,
+    functions: _Functions = None,
     module: Annotated[
         str | None, typer.Option(metavar="NAME", help="The module's name; default: from r2p.toml or the host name.")
     ] = None,
     remap: Annotated[
         list[str] | None, typer.Option(metavar="OLD:=NEW", help="Rename a topic for all its nodes (repeatable).")
     ] = None,
-    priority: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NODE=N", help="Nodes of higher priority get their messages first; default 0 (repeatable)."
-        ),
-    ] = None,
+    priority: _Priority = None,
     restart: Annotated[bool, typer.Option("--restart", help="Restart a crashed node, after a pause.")] = False,
     allow_control: Annotated[
         bool, typer.Option("--allow-control", help="Let other modules change this one by IP links without a key, too.")
@@ -70,12 +75,7 @@ async def command(
     params_file: ParamsFile = None,
     params: Params = None,
     param: Param = None,
-    allow_load: Annotated[
-        Path | None,
-        typer.Option(
-            "--allow-load", metavar="DIR", help="Let r2p node start, end and swap nodes here, with code in DIR."
-        ),
-    ] = None,
+    allow_load: _AllowLoad = None,
     via: Via = None,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended, or Ctrl-C.
