@@ -80,6 +80,15 @@ class Sample(msgspec.Struct, Generic[T], gc=False):
         return self.expires or self.deadline
 
 
+class DirectedSample(Sample, gc=False):
+    """A sample for one module, `to` (its instance), as an answer to a call.
+
+    A link that can send to one module alone does so; on others all subscribers receive it, and leave it to that one.
+    """
+
+    to: int = 0
+
+
 class LastReceived(msgspec.Struct, eq=False, weakref=True):
     """The last message of a remote publisher, from any link."""
 

@@ -306,7 +306,7 @@ class ServiceServer(Generic[Q, R]):
         if answer is None:
             return False
         self.repeated += 1
-        self._send(answer, link, left)
+        self._send(answer, link, left, key[0])
         return True
 
     def _answer(self, key: tuple[int, int], link: str, given: int, kind: Kind, body: bytes) -> None:
@@ -317,11 +317,11 @@ class ServiceServer(Generic[Q, R]):
         instance, number = key
         data = services.pack(instance, number, kind, self._space.instance, body, self._size)
         self._answers.put(instance, number, data, self._space.clock.monotonic(), 2 * given)
-        self._send(data, link, given)
+        self._send(data, link, given, instance)
 
-    def _send(self, data: bytes, link: str, lifetime: int) -> None:
+    def _send(self, data: bytes, link: str, lifetime: int, caller: int) -> None:
         if self._outlet is not None:
-            self._outlet.send(data, lifetime or _ANSWER_LIFETIME, link)
+            self._outlet.answer(data, lifetime or _ANSWER_LIFETIME, link, caller)
 
     def _lifetime(self, sample: Sample) -> tuple[int, int]:
         """Return the caller's time-out and what is left of it (ns); what is usual and 0, where it is unknown.

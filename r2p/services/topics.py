@@ -14,7 +14,7 @@ from r2p.runtime.backpressure import Sink
 from r2p.runtime.publishers import SporadicPublisher
 from r2p.runtime.qos import Sporadic
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue
-from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.sample import DirectedSample, PublisherClass, Sample
 from r2p.runtime.topic import Topic, TopicSpace
 
 PENDING_MAX = 64
@@ -82,12 +82,23 @@ class Outlet(SporadicPublisher[Any]):
         """The topic."""
         return self._topic
 
-    def send(self, data: bytes, lifetime: int, link: str = "") -> None:
-        """Publish a packed message that is worth nothing after `lifetime` (ns); only by this link, if one is given."""
+    def send(self, data: bytes, lifetime: int) -> None:
+        """Publish a packed message that is worth nothing after `lifetime` (ns)."""
         self.sent = sequence = self.sent + 1
         stamp = self._now()
         sample = Sample(data, self._source, stamp, stamp + lifetime, sequence, PublisherClass.SPORADIC)
-        blocked = self._topic.deliver_by(link, sample) if link else self._topic.deliver(sample)
+        blocked = self._topic.deliver(sample)
+        if blocked is not None:
+            self._deliver_later(sample, blocked, lifetime)
+
+    def answer(self, data: bytes, lifetime: int, link: str, caller: int) -> None:
+        """Publish an answer by the link that its request came from, for the module `caller` (its instance)."""
+        self.sent = sequence = self.sent + 1
+        stamp = self._now()
+        sample = DirectedSample(
+            data, self._source, stamp, stamp + lifetime, sequence, PublisherClass.SPORADIC, to=caller
+        )
+        blocked = self._topic.deliver_by(link, sample)
         if blocked is not None:
             self._deliver_later(sample, blocked, lifetime)
 

@@ -21,7 +21,7 @@ from r2p.keys import SharedKey
 from r2p.messages import SIZE_MAX, ClockOffset
 from r2p.names import MANAGEMENT
 from r2p.protocols.time_left import TimesLeft
-from r2p.runtime.sample import PublisherClass, Sample, Source
+from r2p.runtime.sample import DirectedSample, PublisherClass, Sample, Source
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url, duration, key_file
@@ -132,6 +132,11 @@ class MemoryNetwork:
         for address in self._ports:
             if address != datagram.port:
                 self._send_to(address, datagram)
+
+    def send_to(self, address: int, datagram: Datagram) -> None:
+        """Send to one port, if it is still there."""
+        if address in self._ports:
+            self._send_to(address, datagram)
 
     def release(self, places: int) -> None:
         """Note that messages are no longer on their way."""
@@ -245,7 +250,11 @@ class MemoryLink(BufferedLink):
             sample.hops + bool(sample.source.link),
             sample.clock,
         )
-        self.network.send(datagram)
+        to = self.discovery.address_of(sample.to) if isinstance(sample, DirectedSample) else None
+        if isinstance(to, int):
+            self.network.send_to(to, datagram)
+        else:
+            self.network.send(datagram)
 
     def write_call(self, data: bytes, to: Hashable) -> None:
         self.network.send(Datagram(self._address, own_services.topic_of(data), data))

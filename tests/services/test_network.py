@@ -18,6 +18,7 @@ from r2p.codecs import services
 from r2p.codecs.services import Kind, ServiceHeader
 from r2p.sim import run
 from r2p.testing.network import Network, node_in
+from r2p.transports.memory import Datagram, MemoryPort
 from tests.services.common import Add, Desk, Names, add, outcome, until
 
 if TYPE_CHECKING:
@@ -324,3 +325,37 @@ def test_what_a_flood_of_requests_makes_a_server_remember_is_bounded() -> None:
             assert len([key for key in served._answers if key[0] == 7]) == 64
 
     run(scenario)
+
+
+async def test_an_answer_goes_to_its_caller_alone() -> None:
+    """A memory network can do that; behind a gateway, and from callers that no module is known for, it goes to all."""
+    network, far = Network(), Network()
+    heard: list[int] = []
+
+    def hear(datagram: Datagram) -> None:
+        if datagram.topic == b"add_r":
+            heard.append(services.decode(datagram.data).number)
+
+    network.plug_in(network.new_address(), MemoryPort(network, hear, lambda: None))
+    async with (
+        network.node("S") as server,
+        network.node("C") as client,
+        network.node("OTHER") as other,
+        network.module("GW", far, bridge=True),
+        far.node("FAR") as behind,
+    ):
+        server.serve("add", Add, add)
+        calls, distant = client.client("add", Add), behind.client("add", Add)
+        others = other.subscribe("add_r", None)
+        await calls.ready(5)
+        await distant.ready(5)
+        await asyncio.sleep(1)
+        for number in range(5):
+            assert await calls.call(Add.Request(a=number)) == Add.Response(total=number)
+        assert (heard, len(others.queue)) == ([], 0)
+        assert await distant.call(Add.Request(a=7)) == Add.Response(total=7)
+        assert len(heard) == len(others.queue) > 0
+        network.duplicate = 1.0  # the request comes twice, so the answer goes out again, and arrives four times
+        assert await calls.call(Add.Request(a=8)) == Add.Response(total=8)
+        await asyncio.sleep(1)
+        assert len(heard) == len(others.queue)

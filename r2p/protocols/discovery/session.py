@@ -104,6 +104,10 @@ class DiscoveryProtocol(ABC):
         """The instance of the only r2p module on the link itself; None unless there is one, and just one."""
         return None
 
+    def address_of(self, instance: int) -> PeerAddress:
+        """Return the address of an r2p module on the link itself; None if it is not known, or behind a gateway."""
+        return None
+
     @property
     @abstractmethod
     def generation(self) -> int:
@@ -343,6 +347,10 @@ class Discovery(DiscoveryProtocol):
     @property
     def sole_peer(self) -> int | None:
         return self._directory.sole_peer()
+
+    def address_of(self, instance: int) -> PeerAddress:
+        info = self.modules.get(self._directory.name_of(instance))
+        return info.source if info is not None and info.instance == instance and not info.hops else None
 
     @property
     def generation(self) -> int:
