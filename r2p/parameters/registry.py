@@ -292,8 +292,10 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
 
     def _first_value(self, owner: ParameterOwner, name: Name, definition: ParameterDefinition) -> _Value:
         """Return the value of a parameter that is declared now; what was set before its node crashed comes first."""
-        others = {each.name: each.value for each in self._of(owner.name) if each.owner is owner}
-        definition.verify(definition.default, others | {definition.name: definition.default})
+        own = [each for each in self._of(owner.name) if each.owner is owner]
+        defaults = {each.name: each.definition.default for each in own}
+        definition.verify(definition.default, defaults | {definition.name: definition.default})
+        others = {each.name: each.value for each in own}
         kept = self._run_time.get(name)
         if kept is not None:
             try:
@@ -303,7 +305,13 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
                 owner.log.warning("a value of before does not fit any more and is forgotten: %s", error)
         self._check_saved(owner, name, definition, others)
         value, origin = self._start_value(name, definition, saved=name not in self._unsaved)
-        return self._verified(definition, others, value, origin)
+        try:
+            return self._verified(definition, others, value, origin)
+        except ParameterError as error:
+            if origin > Origin.SAVED:
+                raise
+            owner.log.warning("it does not go together with the first values of other parameters: %s", error)
+            return value, origin
 
     def _verified(
         self, definition: ParameterDefinition, others: Mapping[str, Any], value: Any, origin: Origin

@@ -5,6 +5,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from r2p import BridgeOptions, Module, Node
+from r2p.parameters.sources import GivenParameters
 from r2p.transports.memory import MemoryLink, MemoryNetwork
 
 
@@ -22,14 +23,15 @@ class Network(MemoryNetwork):
         remap: dict[str, str] | None = None,
         observer: bool = False,
         bridge: bool | BridgeOptions = False,
+        params: GivenParameters = None,
     ) -> Module:
-        """Return a module on this network, an `r2p.Module`; open it with `async with`.
+        """Return a module on this network, an `r2p.Module`; open it with `async with`. `params` are as for `Module`.
 
         It also has a link on each of the `others`; with `bridge` it is a gateway between all of them.
         """
         via = [each.transport() for each in (self, *others)]
         # No watchdog: it measures real time, and a slow computer is not what is tested.
-        return Module(name, via=via, remap=remap, observer=observer, bridge=bridge, watchdog=False)
+        return Module(name, via=via, remap=remap, observer=observer, bridge=bridge, watchdog=False, params=params)
 
     @asynccontextmanager
     async def node(self, module: str, *, name: str = "test", priority: int = 0) -> AsyncIterator[Node]:

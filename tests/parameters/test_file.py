@@ -16,6 +16,7 @@ from r2p.parameters.file import ParameterFile
 from r2p.testing.network import node_in
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 pytestmark = pytest.mark.virtual_time
@@ -95,6 +96,31 @@ async def test_keeps_what_it_does_not_know_and_reports_what_does_not_fit(
     before = tomllib.loads(BY_HAND)
     before["params"]["PC1"]["other"] = {"name": "z"}
     assert contents(path) == before
+
+
+@pytest.mark.parametrize(
+    ("saved", "values", "reason"),
+    [
+        ("low = 5\nhigh = 6", (5.0, 6.0), ""),
+        ("high = 0.5", (1.0, 2.0), "PC1/a.high = 0.5: too low"),
+        ("low = 5", (5.0, 2.0), "PC1/a.high = 2.0: too low"),
+    ],
+)
+async def test_a_saved_file_keeps_no_node_from_starting(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, saved: str, values: tuple[float, float], reason: str
+) -> None:
+    """Also where its values do not go together with each other, or with the defaults of the others."""
+
+    def above(value: float, others: Mapping[str, Any]) -> str | None:
+        return None if value > others["low"] else "too low"
+
+    path = tmp_path / "params.toml"
+    path.write_text(f"format = 1\n[params.PC1.a]\n{saved}\n")
+    async with r2p.Module("PC1", params_file=path) as module, node_in(module, name="a") as node:
+        low, high = node.parameter("low", 1.0), node.parameter("high", 2.0, check=above)
+        assert (low.value, high.value) == values
+        assert bool(caplog.records) == bool(reason)
+        assert reason in caplog.text
 
 
 async def test_reads_the_file_again_on_a_reboot_and_keeps_its_values_if_it_is_broken_then(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from types import MemberDescriptorType
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -34,6 +35,10 @@ async def test_is_declared_read_and_set() -> None:
         (info,) = module.parameters.infos()
         assert (info.full_name, info.kind, info.value, info.default) == ("PC1/speed.kp", "float", 2.0, 0.5)
         assert (info.minimum, info.maximum, info.unit, info.doc) == (0.0, 10.0, "V", "Gain.")
+
+
+def test_reading_a_value_calls_no_function() -> None:
+    assert isinstance(vars(r2p.Parameter)["value"], MemberDescriptorType)  # a slot
 
 
 async def test_mistakes_of_programs_are_named() -> None:

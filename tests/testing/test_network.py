@@ -77,3 +77,8 @@ async def test_a_gateway_joins_two_networks(r2p_network: Network) -> None:
 
 async def test_each_test_has_a_network_of_its_own(r2p_network: Network) -> None:
     assert not r2p_network.counts
+
+
+async def test_first_values_of_parameters(r2p_network: Network) -> None:
+    async with r2p_network.module("A", params={"kp": 2}) as module, node_in(module) as node:
+        assert node.parameter("kp", 0.5).value == 2.0
