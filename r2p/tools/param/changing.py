@@ -41,7 +41,7 @@ async def set_(
     reboot: Reboot = False,
     format: Format = None,
 ) -> None:
-    """Set parameters of a module, one or several: all of them or, if one is refused, none.
+    """Set parameters of a module: all of them, or none.
 
     The module must let it in: over TCP and zenoh with --allow-control or a key. With --firmware APP, fields of an app
     in the flash of firmware are set, and read back.
@@ -68,7 +68,7 @@ async def load(
     file: Annotated[Path, typer.Argument(metavar="FILE", show_default=False, help="As r2p param dump prints it.")],
     target: MaybeTarget = None,
 ) -> None:
-    """Set the parameters that a TOML file has, or only those of one module or node of it.
+    """Set what a file of dump has, or a part of it.
 
     Of each module all of them or, if one is refused, none. Read-only ones that have their value already are left out.
     """
@@ -84,27 +84,31 @@ async def load(
 
 
 async def reset(session: Session, target: Target, names: Names = None) -> None:
-    """Undo what was set and saved: parameters get the values of the start without the saved file.
+    """Undo what was set and saved.
 
-    The file itself changes with the next `r2p param save`. Read-only parameters stay.
+    Parameters get the values that the module would start with without its saved file. The file itself changes with the
+    next `r2p param save`. Read-only parameters stay.
     """
     infos = await find(session, target, names or [])
     module, network = one_module(infos, target), session.module.network
-    by_node: dict[str, list[str]] = {}
+    chosen: dict[str, list[str]] = {}
     for info in infos:
-        if not info.read_only or names or target.endswith(info.name):
-            by_node.setdefault(info.node, []).append(info.name)
+        if not info.read_only or names or len(infos) == 1:  # those that are named are left to the module to refuse
+            chosen.setdefault(info.node, []).append(info.name)
     with _answered(session, module):
-        for node, chosen in by_node.items():
-            await network.reset_parameters(module, node=node, names=chosen)
-    count = sum(map(len, by_node.values()))
+        if target == module and not names:
+            await network.reset_parameters(module)
+        else:
+            for node, own in chosen.items():
+                await network.reset_parameters(module, node=node, names=own)
+    count = sum(map(len, chosen.values()))
     notify(f"{module}: {count} parameter{'' if count == 1 else 's'} reset; the file of the module changes with save")
 
 
 async def save(session: Session, module: ModuleName) -> None:
-    """Have a module write what was set at run time to its file: they are there after its next start.
+    """Have a module save what was set.
 
-    The module was started with that file (`r2p run --params-file`); there is no other.
+    It writes to the file that it was started with (`r2p run --params-file`), for its next start.
     """
     modules = await find_modules(session, module)
     if module not in modules:

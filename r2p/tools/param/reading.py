@@ -86,7 +86,10 @@ async def info(session: Session, target: Target, names: Names = None, *, format:
 
 
 async def dump(session: Session, target: MaybeTarget = None) -> None:
-    """Print parameters as a TOML file, which `r2p param load` and `r2p run --params` read."""
+    """Print parameters as a TOML file.
+
+    `r2p param load` and `r2p run --params` read it.
+    """
     infos = await find(session, target)
     if not infos:
         raise r2p.Error(session.none_yet("parameters"))
@@ -105,7 +108,7 @@ async def watch(
     timeout: Timeout = None,
     format: Format = None,
 ) -> None:
-    """Print each change of parameters, until Ctrl-C: of all modules, one, or a node.
+    """Print each change of parameters, until Ctrl-C.
 
     A module that does not answer is asked again: watching goes on when it is back.
     """
@@ -115,10 +118,16 @@ async def watch(
     if not modules:
         raise r2p.Error(session.none_yet("modules with parameters"))
     watched = f"{len(infos)} parameter{'' if len(infos) == 1 else 's'} of {', '.join(modules)}"
-    notify(f"watching {watched}; Ctrl-C ends it")
     async with output.while_read(), patience(f"no change of {watched}", timeout) as received:
-        printer = _ChangePrinter(output, target, names or [], infos, received)
-        await printer.run(session, modules, 1 if once else count)
+        printer = _ChangePrinter(output, target, names or [], received)
+        printer.remember(infos)
+        async with asyncio.TaskGroup() as tasks:
+            watching = [tasks.create_task(printer.watch(session, module)) for module in modules]
+            printer.remember(await find(session, target, names or []))  # after the watch began: no change is missed
+            notify(f"watching {watched}; Ctrl-C ends it")
+            await printer.wait(1 if once else count)
+            for task in watching:
+                task.cancel()
 
 
 class _ChangePrinter:
@@ -129,27 +138,26 @@ class _ChangePrinter:
         output: Output,
         target: str | None,
         names: list[str],
-        infos: list[r2p.ParameterInfo],
         received: Callable[[], None],
     ) -> None:
         self._output = output
         self._target = target
         self._names = names
         self._received = received
-        self._values = {each.full_name: each.value for each in infos}
+        self._values: dict[str, Any] = {}
         self._last = asyncio.Event()
         self._left: int | None = None
 
-    async def run(self, session: Session, modules: list[str], count: int | None) -> None:
-        """Print `count` changes (None: until cancelled)."""
-        self._left = count
-        async with asyncio.TaskGroup() as tasks:
-            watching = [tasks.create_task(self._watch(session, module)) for module in modules]
-            await self._last.wait()
-            for task in watching:
-                task.cancel()
+    def remember(self, infos: list[r2p.ParameterInfo]) -> None:
+        """Note the values before the changes."""
+        self._values |= {each.full_name: each.value for each in infos}
 
-    async def _watch(self, session: Session, module: str) -> None:
+    async def wait(self, count: int | None) -> None:
+        """Wait until `count` changes are printed, from now on (None: for ever)."""
+        self._left = count
+        await self._last.wait()
+
+    async def watch(self, session: Session, module: str) -> None:
         """Print the changes of one module, whatever it does meanwhile."""
         while True:
             try:
