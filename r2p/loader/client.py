@@ -13,7 +13,7 @@ import r2p
 from r2p.codecs.loader import FLAGS_WORD, SIZE, LinkingAddresses, LinkingSetup
 from r2p.loader import procedures
 from r2p.loader.procedures import FLAGS_SIZE, AppListing, LinkFunction, flags_are_enabled, with_enabled
-from r2p.loader.session import PATIENCE, LoaderError, LoaderSession, LoaderSilent, Procedure
+from r2p.loader.session import PATIENCE, LoaderError, LoaderFault, LoaderSession, LoaderSilent, Procedure
 from r2p.names import LOADER_PREFIX, module_path
 
 ORDER_TIMEOUT = 10.0
@@ -57,6 +57,7 @@ class LoaderClient:
         self._module = module
         self._session = LoaderSession(patience)
         self._changed = asyncio.Event()
+        self._fresh = False  # it was restarted, and has loaded nothing since
         self._denied = ""  # why a gateway does not forward an order
         self._node: r2p.Node | None = None
         self._ready = asyncio.Event()
@@ -86,6 +87,16 @@ class LoaderClient:
         """Messages that were not what the session expected, by reason."""
         return dict(self._session.dropped)
 
+    @property
+    def connected(self) -> bool:
+        """Return whether any link of this program is up."""
+        return any(link.up for link in self._module.links)
+
+    @property
+    def is_there(self) -> bool:
+        """Return whether the module was in its loader when it was last seen."""
+        return self._state() == "boot"
+
     # There and back
 
     def view(self) -> r2p.ModuleView | None:
@@ -97,7 +108,7 @@ class LoaderClient:
         """Restart the module into its loader (BOOTLOAD), and wait until it is there. All its nodes end.
 
         A module that is there already stays as it is; with `restart` its loader is restarted, which frees the RAM that
-        aborted loads have left. Raises LoaderError for a module that has no loader, LoaderSilent if it does not get
+        loads have used since its last start by this client. Raises LoaderError for a module that has no loader, LoaderSilent if it does not get
         there.
         """
         self._module.query()
@@ -107,9 +118,10 @@ class LoaderClient:
             raise LoaderError(f"{self.name} is an r2p module, a program without a boot loader: apps are for firmware")
         if view is None or view.state != "boot":
             await self._order(r2p.Command.BOOTLOAD, lambda _: self._state() == "boot")
-            self.restarted = True
-        elif restart:
+            self.restarted = self._fresh = True
+        elif restart and not self._fresh:
             await self._restart()
+            self.restarted = self._fresh = True
         self._check_alone()
 
     async def leave(self) -> None:
@@ -155,7 +167,6 @@ class LoaderClient:
             self._module.command(r2p.Command.BOOTLOAD, self.name)
             await asyncio.sleep(_REPEAT / 5)
         await self._order(r2p.Command.BOOTLOAD, heard_since)
-        self.restarted = True
 
     async def _until(self, condition: Callable[[], bool], timeout: float) -> bool:
         loop = asyncio.get_running_loop()
@@ -210,7 +221,8 @@ class LoaderClient:
     async def load(
         self, setup: LinkingSetup, link: LinkFunction, progress: Callable[[int, int], None] = lambda done, total: None
     ) -> LinkingAddresses:
-        """Load one app behind the installed ones, in one session and without any second try: see `deploy`."""
+        """Load one app behind the installed ones, in one session; `load_apps` begins again after a fault."""
+        self._fresh = False
         return await self._run(procedures.load(setup, link, progress))
 
     async def remove_last(self) -> None:
@@ -232,7 +244,7 @@ class LoaderClient:
         for _ in range(_TRIES - 1):
             try:
                 return await self._run(procedure())
-            except LoaderError:
+            except LoaderFault:
                 await self.go_idle()
         return await self._run(procedure())
 

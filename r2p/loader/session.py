@@ -45,7 +45,11 @@ class LoaderError(Error):
     """A session with a boot loader that did not do what was asked."""
 
 
-class LoaderRefused(LoaderError):
+class LoaderFault(LoaderError):
+    """A session that ended before its time, through no fault of what was asked: it may be begun again."""
+
+
+class LoaderRefused(LoaderFault):
     """A NACK: the loader ended the session. `line` is the line of its source that refused."""
 
     def __init__(self, asked: str, line: int) -> None:
@@ -54,11 +58,11 @@ class LoaderRefused(LoaderError):
         self.line = line
 
 
-class LoaderSilent(LoaderError):
+class LoaderSilent(LoaderFault):
     """No answer, or no sign that an order was obeyed."""
 
 
-class LoaderConfused(LoaderError):
+class LoaderConfused(LoaderFault):
     """An answer that does not belong to its question."""
 
 

@@ -25,6 +25,7 @@ GROUPS = {
     "node": ("r2p.tools.node", "List and inspect nodes."),
     "param": ("r2p.tools.param", "List, get, set and save parameters of nodes."),
     "module": ("r2p.tools.module", "List, stop and restart modules."),
+    "app": ("r2p.tools.app", "List, load, remove and start the apps of a firmware module."),
     "msg": ("r2p.tools.msg", "Show message types, and exchange them with C and ROS."),
     "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots."),
     "key": ("r2p.tools.key", "Make a shared key for links."),

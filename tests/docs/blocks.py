@@ -39,7 +39,7 @@ from pathlib import Path
 import msgspec
 
 ROOT = Path(__file__).parents[2]
-LANGUAGES = {"python", "console", "toml", "json5", "text", "c", "ini"}
+LANGUAGES = {"python", "console", "toml", "json5", "text", "c", "hex", "ini"}
 NOTES = {"continues", "output", "pytest", "frames", "recorded", "keeps running", "exits", "not run", "compiled"}
 
 _FENCE = re.compile(

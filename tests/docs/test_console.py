@@ -22,7 +22,7 @@ PORTS = ("2323", "2324", "2325", "2326")
 ROBOT = "192.168.0.10:23"
 DEVICE = "/dev/ttyUSB0"
 
-_RUN = {"console", "toml", "python"}
+_RUN = {"console", "toml", "python", "hex"}
 
 
 @contextlib.contextmanager
