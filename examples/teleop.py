@@ -1,9 +1,8 @@
 """Drive a robot by keys: w, a, s, d move it, q and e turn it, all others stop it.
 
-r2p sim triskar2 --via tcp-listen:2323                   in one terminal
-r2p run teleop.py:keys --via tcp:127.0.0.1:2323          in another one
-
-When this program ends, or the cable is pulled, commands stop coming and the robot stops by itself.
+When this program ends, or the cable is pulled, commands stop coming and the robot stops by itself. In two terminals:
+r2p sim triskar2 --via tcp-listen:2323
+r2p run teleop.py:keys --via tcp:127.0.0.1:2323
 """
 
 import contextlib
@@ -32,6 +31,7 @@ def single_keys() -> Iterator[None]:
             tty.setcbreak(sys.stdin)
         yield
     finally:
+        print()  # else the shell's prompt would follow the robot's place
         if before is not None:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 

@@ -120,7 +120,7 @@ async def test_teleop(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
         assert robot.pose == pytest.approx(before, abs=1e-3)
     printed = capsys.readouterr().out
     assert printed.startswith("w, a, s, d: move    q, e: turn    any other key: stop\n")
-    assert re.search(r"\rx +0\.\d\d m   y +0\.[5-9]\d m   heading +-?0\.\d\d rad $", printed)
+    assert re.search(r"\rx +0\.\d\d m   y +0\.[5-9]\d m   heading +-?0\.\d\d rad \n\Z", printed)
 
 
 @pytest.mark.virtual_time

@@ -112,10 +112,12 @@ def call_after(seconds: float, call: Callable[[], object]) -> Iterator[None]:
 
 
 @contextlib.asynccontextmanager
-async def patience(missing: str, timeout: float | None) -> AsyncIterator[Callable[[], None]]:
+async def patience(
+    missing: str, timeout: float | None, advice: Callable[[], str] = lambda: ""
+) -> AsyncIterator[Callable[[], None]]:
     """Raise TimedOut in the block if nothing is received for `timeout` seconds; `missing` says so: "no message of x".
 
-    The block gets a function to call for each message.
+    The block gets a function to call for each message. `advice` returns what to add: "; did you mean y?".
     """
     loop = asyncio.get_running_loop()
     try:
@@ -127,7 +129,7 @@ async def patience(missing: str, timeout: float | None) -> AsyncIterator[Callabl
 
             yield received
     except TimeoutError:
-        raise TimedOut(f"{missing} for {timeout:g} s") from None
+        raise TimedOut(f"{missing} for {timeout:g} s{advice()}") from None
 
 
 async def wait_until(condition: Callable[[], bool], timeout: float) -> bool:

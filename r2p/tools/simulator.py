@@ -168,7 +168,8 @@ async def simulate(
     async with robot, r2p.Module("PC1", via=_INSIDE, watchdog=False) as pc:
         _check_parameters(robot)
         screen.print(
-            f"Triskar2 starts: {len(robot.modules)} modules on a simulated RTCAN bus, which settles in about 2 s"
+            f"Triskar2 starts: {len(robot.modules)} modules on a simulated RTCAN bus",
+            "  waiting about 2 s: they claim their ids, elect a master and reserve slots",
         )
         with contextlib.suppress(TimeoutError):  # on a computer that is too slow: show the robot as it is
             await robot.ready(_READY)

@@ -15,7 +15,7 @@ from r2p.tools.options import Count, Format, Once, Timeout
 from r2p.tools.output import Output, flatten, notify
 from r2p.tools.session import REPORT_WAITING_AFTER, Session, UsageError, patience
 from r2p.tools.topic.filter import Filter, FilterError
-from r2p.tools.topic.watching import Topics, TypeName, received_samples, while_publishers_fit
+from r2p.tools.topic.watching import Topics, TypeName, advice, received_samples, while_publishers_fit
 from r2p.tools.types import Types, suggestion
 from r2p.tools.values import META, Form, pick, to_plain
 from r2p.units import SECOND
@@ -80,7 +80,8 @@ async def echo(
 
     missing = f"{'no message passed the filter' if filter else 'nothing received'} on {', '.join(names)}"
     try:
-        async with output.while_read(), patience(missing, timeout) as received, asyncio.TaskGroup() as group:
+        suggest = advice(session, names, timeout)
+        async with output.while_read(), patience(missing, timeout, suggest) as received, asyncio.TaskGroup() as group:
             if selection.labelled:
                 await _print_header(session, output, readers, selection)
             for reader in readers:

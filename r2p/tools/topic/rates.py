@@ -19,7 +19,7 @@ from r2p.names import topic_name
 from r2p.tools.options import Count, Format, Once, Timeout
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, patience
-from r2p.tools.topic.watching import Topic, TypeName, received_samples, while_publishers_fit
+from r2p.tools.topic.watching import Topic, TypeName, advice, received_samples, while_publishers_fit
 from r2p.tools.types import Types
 from r2p.units import SECOND
 
@@ -99,7 +99,7 @@ def _command(name: str, kind: type[_Meter]) -> Callable[..., Coroutine[Any, Any,
 
         async with (
             output.while_read(),
-            patience(f"nothing received on {topic}", timeout) as received,
+            patience(f"nothing received on {topic}", timeout, advice(session, [subscriber.topic], timeout)) as received,
             while_publishers_fit(session, subscriber, cls),
             asyncio.TaskGroup() as tasks,
         ):

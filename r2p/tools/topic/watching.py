@@ -6,7 +6,7 @@ A command reports what it waits for, and suggests other topics where the name ma
 import asyncio
 import contextlib
 import difflib
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any
 
 import typer
@@ -180,6 +180,21 @@ def hint(session: Session, text: str, topic: str, fits: Callable[[r2p.TopicView]
 
     with call_after(HINT_AFTER, report):
         yield
+
+
+def advice(session: Session, topics: Iterable[str], timeout: float | None) -> Callable[[], str]:
+    """Return a function that suggests other topics, for those that are not published when the time is up.
+
+    With more time, `hint` has done so by then.
+    """
+
+    def suggest() -> str:
+        views = session.module.network.topics()
+        unknown = [name for name in topics if not (name in views and is_published(views[name]))]
+        texts = (suggest_topics(session, name, is_published) for name in unknown)
+        return "" if (timeout or 0.0) > HINT_AFTER else next(filter(None, texts), "")
+
+    return suggest
 
 
 async def wait_until_passed_on(session: Session, topic: str) -> None:

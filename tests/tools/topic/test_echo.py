@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import Annotated
+from typing import Annotated, Any
 
 import pytest
 
@@ -12,6 +12,7 @@ import r2p
 from r2p.msg import GatewayStatus, Header, LaserScan, Led, StampedPose3, Velocity3
 from r2p.tools.session import TimedOut, UsageError
 from r2p.tools.topic.echo import QUEUE, echo
+from r2p.tools.topic.rates import hz
 from tests.tools.rig import Firmware, keep_types, printed, robot, tool
 
 
@@ -315,6 +316,15 @@ async def test_topics_with_names_much_like_it_are_named_once(
         with pytest.raises(TimedOut):
             await echo(session, [topic], timeout=20)
     assert capsys.readouterr().err == f"r2p: waiting for a publisher of {topic.lstrip('/')} on memory:lab\n{hint}"
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("command", [echo, hz])
+async def test_a_short_time_out_names_topics_with_names_much_like_it(command: Any) -> None:
+    async with robot(leds), tool() as session:
+        topics = ["ledz"] if command is echo else "ledz"
+        with pytest.raises(TimedOut, match=r"^nothing received on ledz for 1\.5 s; did you mean leds\?$"):
+            await command(session, topics, timeout=1.5)
 
 
 @pytest.mark.virtual_time
