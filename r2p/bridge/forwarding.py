@@ -234,7 +234,7 @@ class BridgedTopic(Topic):
             return _offer(route, sample, blocked)
         if sample.hops >= HOPS_MAX:
             route.dropped["too many hops"] += 1
-        elif sample.deadline and sample.drop_late and port.now() > sample.due:
+        elif sample.deadline and sample.drop_late and port.now() > sample.due and not self._is_latched(sample):
             route.dropped["late"] += 1
         elif shaper is None:
             return _offer(route, sample, blocked)
@@ -243,6 +243,11 @@ class BridgedTopic(Topic):
         else:
             return _offer_shaped(route, shaper.shape(sample, now, port.now()), sample, blocked)
         return blocked
+
+    def _is_latched(self, sample: Sample) -> bool:
+        """Return whether a message may be a latched value, which is worth sending however old it is."""
+        source = self._ports.get(sample.source.link)
+        return source is not None and source.link.latched(self.name)
 
     def _forward_held(self, route: Route, sample: Sample) -> list[Sink] | None:
         return None if route.subscriber is None else self._forward(route, sample, self._monotonic(), None)

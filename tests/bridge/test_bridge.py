@@ -187,14 +187,17 @@ async def test_a_prefix() -> None:
         assert (drain(far), drain(plain), drain(cmd)) == ([1], [], [2])
 
 
-async def test_a_latched_value_reaches_who_joins_later() -> None:
+@pytest.mark.parametrize("klass", [r2p.NonRealTime(), r2p.Sporadic(deadline=0.02)])
+async def test_a_latched_value_reaches_who_joins_later(klass: r2p.NonRealTime | r2p.Sporadic) -> None:
+    """That of an event, too, long after it was due."""
     async with gateway(), node("A", "a") as a:
-        config = a.advertise("leds", Led, latch=True)
+        config = a.advertise("leds", Led, klass, latch=True)
         await config.publish(Led(led=5))
         await asyncio.sleep(0.5)
         for name in ("B", "C"):
             async with node(name, "b") as b:
                 assert (await b.subscribe("leds", Led).fetch(timeout=1)).led == 5
+            await asyncio.sleep(5)
 
 
 async def test_a_late_message_is_dropped_if_its_publisher_said_when() -> None:
