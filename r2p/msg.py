@@ -257,7 +257,7 @@ class PowerEvent(Message):
     HIGH_CURRENT: ClassVar = 4
 
     crossed: u8 = 0
-    """The thresholds that this event is about, crossed in either direction."""
+    """The thresholds that were crossed, in either direction; 0: the event is repeated, while one is exceeded."""
     exceeded: u8 = 0
     """The thresholds beyond which the supply is now."""
     voltage: u16 = 0

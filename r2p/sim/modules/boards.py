@@ -37,6 +37,7 @@ _VOLTAGE_COUNT = 36_000 / ADC_MAX  # mV per count: a divider turns 36 V into 3.3
 _CURRENT_COUNT = 50_000 / ADC_MAX  # mA per count
 _SAMPLE = 0.02  # s: the analog watchdog of the power supply compares each sample
 _ALERT = 0.05  # s: deadline of its events
+_REPEAT = SECOND  # ns between two of them while a threshold is exceeded
 
 
 class Part(Protocol):
@@ -427,15 +428,20 @@ async def power(node: r2p.Node, battery: LeadBattery, topic: str, period: float)
 
 
 async def limits(node: r2p.Node, battery: LeadBattery, topic: str) -> None:
-    """Publish an event when voltage or current crosses a threshold: the analog watchdog of the power supply."""
+    """Publish an event when voltage or current crosses a threshold: the analog watchdog of the power supply.
+
+    While one is exceeded, the event is repeated, for those that came later: firmware has no latched topics.
+    """
     voltage, current = _thresholds(node)
     events = node.advertise(topic, PowerEvent, r2p.Sporadic(deadline=_ALERT), latch=True)
-    async for _ in node.every(_SAMPLE):
+    repeat_at = 0
+    async for tick in node.every(_SAMPLE):
         now = measured(battery)
         crossed = sum(bit for bit, each in voltage.items() if each.update(now.voltage / 1000))
         crossed += sum(bit for bit, each in current.items() if each.update(now.current / 1000))
-        if crossed:
-            exceeded = sum(bit for bit, each in (voltage | current).items() if each.exceeded)
+        exceeded = sum(bit for bit, each in (voltage | current).items() if each.exceeded)
+        if crossed or (exceeded and tick.due >= repeat_at):
+            repeat_at = tick.due + _REPEAT
             await events.publish(PowerEvent(crossed, exceeded, now.voltage, now.current))
 
 

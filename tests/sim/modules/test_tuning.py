@@ -111,6 +111,7 @@ async def test_a_power_supply_publishes_an_event_when_a_threshold_is_crossed(r2p
         assert (await events.fetch(0.1)).exceeded == bits.LOW_VOLTAGE
         late = node.subscribe("power_event", PowerEvent)
         assert (await late.fetch(0.1)).exceeded == bits.LOW_VOLTAGE
+        assert await events.fetch(1.1) == PowerEvent(0, bits.LOW_VOLTAGE, 24_396, 0)
         with pytest.raises(r2p.ParameterError, match="together have to be below high_voltage"):
             module.parameters.set({("limits", "high_voltage"): 25.2})
 
