@@ -28,6 +28,7 @@ CODE_MAX = 256 << 10
 
 _TIMEOUT = 30.0  # seconds that the code of a file may run while it is loaded
 _PREFIX = "_r2p_"  # of the names of modules whose own name has another one already
+_SENT = f"{_PREFIX}sent_"  # ... and of those that were sent
 
 _Signature = tuple[int, int]
 
@@ -76,16 +77,15 @@ class CodeLoader:
     async def _load(self, file: str, function: str, run: Callable[[], types.ModuleType]) -> NodeFunction:
         """Run code, in a thread, as imports may take long, and return a function of its module."""
         async with self._loading:
-            with _unless_it_fails():
-                try:
-                    module = await _in_thread(run)
-                except TimeoutError:
-                    raise Error(f"{file} still runs {_TIMEOUT:g} s after its start: it has to end at once") from None
-                except BaseException as error:  # SystemExit as well: the user's code may raise anything
-                    if isinstance(error, asyncio.CancelledError | KeyboardInterrupt):
-                        raise
-                    raise Error(f"can't load {file}:\n{_traceback(error)}") from None
+            before = dict(self._own_modules()), dict(sys.modules)
+            try:
+                module = await _in_thread(run)
                 found = _function(file, module, function)
+            except BaseException as error:  # SystemExit as well: the user's code may raise anything
+                self._undo(*before)
+                if isinstance(error, Error | asyncio.CancelledError | KeyboardInterrupt):
+                    raise
+                raise Error(f"can't load {file}:\n{_traceback(error)}") from None
         self._known = {name: _signature(path) for name, path in self._own_modules()}
         return found
 
@@ -107,18 +107,27 @@ class CodeLoader:
         changed = {name for name, path in own.items() if self._known.get(name) != _signature(path)}
         while more := {name for name in own.keys() - changed if _uses(sys.modules[name], changed)}:
             changed |= more
-        for name in changed:
+        for name in changed & own.keys():
             cached = getattr(sys.modules.pop(name).__spec__, "cached", None)
             if cached:  # Python compares times in seconds: a second change in one would not be seen
                 with contextlib.suppress(OSError):
                     Path(cached).unlink(missing_ok=True)
         importlib.invalidate_caches()
 
+    def _undo(self, own: dict[str, Path], modules: dict[str, types.ModuleType]) -> None:
+        """Put back the modules of the directory as they were. Others that were imported stay: they may be in use."""
+        for name in dict(self._own_modules()):
+            if name not in own:
+                del sys.modules[name]
+        sys.modules.update({name: modules[name] for name in own})
+
     def _own_modules(self) -> Iterator[tuple[str, Path]]:
         """Return the names of all loaded modules whose files are in the directory, with these."""
         for name, module in list(sys.modules.items()):
             file = getattr(module, "__file__", None)
-            if name != "__main__" and isinstance(file, str) and Path(file).is_relative_to(self.directory):
+            if name == "__main__" or not isinstance(file, str):
+                continue
+            if Path(file).is_relative_to(self.directory) or name.startswith(_SENT):
                 yield name, Path(file)
 
 
@@ -160,7 +169,7 @@ def _run_sent(name: str, code: bytes) -> types.ModuleType:
     lines = code.decode(errors="replace").splitlines(keepends=True)
     linecache.cache[filename] = len(code), None, lines, filename  # tracebacks quote it
     stem = "".join(each if each.isalnum() else "_" for each in name.removesuffix(".py"))
-    module = types.ModuleType(f"{_PREFIX}sent_{stem}")
+    module = types.ModuleType(f"{_SENT}{stem}")
     module.__file__ = filename
     return _run(module, code, filename)
 
@@ -171,20 +180,6 @@ def _run(module: types.ModuleType, source: bytes, filename: str) -> types.Module
     exec(code, module.__dict__)  # noqa: S102 - what this file is for: see docs/security.md
     linecache.checkcache(filename)
     return module
-
-
-@contextlib.contextmanager
-def _unless_it_fails() -> Iterator[None]:
-    """Undo what the block does to `sys.modules` if it raises."""
-    before = dict(sys.modules)
-    try:
-        yield
-    except BaseException:
-        for name in sys.modules.keys() - before.keys():
-            if name.partition(".")[0] not in before:
-                sys.modules.pop(name, None)
-        sys.modules.update({name: module for name, module in before.items() if sys.modules.get(name) is not module})
-        raise
 
 
 def _traceback(error: BaseException) -> str:
@@ -212,30 +207,37 @@ def _function(file: str, module: types.ModuleType, name: str) -> NodeFunction:
 async def _in_thread(run: Callable[[], types.ModuleType]) -> types.ModuleType:
     """Run code in a thread of its own, which does not keep the process going; under virtual time, here.
 
-    Raises TimeoutError if it takes too long.
+    Raises Error if it takes too long.
     """
     loop = asyncio.get_running_loop()
     if clock_of(loop).virtual:
         return run()
     result: asyncio.Future[types.ModuleType] = loop.create_future()
 
-    def finish(module: types.ModuleType | None, error: BaseException | None) -> None:
+    def finish(module: types.ModuleType | None, error: Exception | None) -> None:
         if result.done():
             return
-        if error is not None:
-            result.set_exception(error if not isinstance(error, StopIteration) else Error(repr(error)))
-        elif module is not None:
+        if module is not None:
             result.set_result(module)
+        else:
+            result.set_exception(error or Error("nothing was loaded"))
 
     def work() -> None:
         module, error = None, None
         try:
             module = run()
-        except BaseException as raised:  # noqa: BLE001 - the user's code: it is raised again where it is awaited
+        except Exception as raised:  # noqa: BLE001 - the user's code: it is raised again where it is awaited
             error = raised
+        except BaseException as raised:  # noqa: BLE001 - SystemExit and the like would end the program there
+            error = Error(f"it raises {type(raised).__name__}: {raised}")
         with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(finish, module, error)
 
     threading.Thread(target=work, name="r2p-load", daemon=True).start()
-    async with asyncio.timeout(_TIMEOUT):
-        return await result
+    await asyncio.wait([result], timeout=_TIMEOUT)
+    if not result.done():
+        result.cancel()
+        raise Error(
+            f"the file still runs {_TIMEOUT:g} s after its start: what it does has to be in the node's function"
+        )
+    return result.result()

@@ -237,7 +237,7 @@ class NodeSwap:
 
     async def _end_old(self) -> bool:
         """End the old node; return False if its clean-up hangs: then its publishers are closed all the same."""
-        self._replaced.publishers += [each for each in self.old.node.publishers if each.hand_over is None]
+        self._replaced.publishers = [each for each in self.old.node.publishers if each.hand_over is None]
         self.old.node.handing_over = True
         task = self.old.cancel()
         if task is None:

@@ -66,6 +66,16 @@ def complete_node(ctx: typer.Context, incomplete: str) -> list[str]:
     return _node_beginning(incomplete, on_network(ctx, nodes))
 
 
+def complete_node_of_module(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Completions for a node of the module that stands before it."""
+    module = ctx.params.get("module")
+
+    async def own(session: Session) -> list[str]:
+        return [name.rpartition("/")[2] for name in await nodes(session) if name.rpartition("/")[0] == module]
+
+    return beginning(incomplete, on_network(ctx, own))
+
+
 def complete_node_or_module(ctx: typer.Context, incomplete: str) -> list[str]:
     """Completions for a node, or a module."""
 

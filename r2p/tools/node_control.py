@@ -8,7 +8,7 @@ import typer
 
 import r2p
 from r2p.names import module_path, node_name
-from r2p.tools.completion import complete_module
+from r2p.tools.completion import complete_module, complete_node_of_module
 from r2p.tools.node_states import find_module
 from r2p.tools.options import CLASS_NAMES, Format
 from r2p.tools.output import Output, notify
@@ -17,7 +17,7 @@ from r2p.tools.session import Session, TimedOut, UsageError
 T = TypeVar("T")
 
 ModuleName = Annotated[str, typer.Argument(metavar="MODULE", autocompletion=complete_module, show_default=False)]
-NodeName = Annotated[str, typer.Argument(metavar="NODE", show_default=False)]
+NodeName = Annotated[str, typer.Argument(metavar="NODE", autocompletion=complete_node_of_module, show_default=False)]
 Target = Annotated[
     str,
     typer.Argument(
@@ -53,11 +53,11 @@ class _Code:
         """Note how many bytes have been sent."""
         self._done, self._total = done, total
 
-    def awaited(self) -> str:
-        """Say what a command waits for."""
+    def awaited(self, what: str) -> str:
+        """Say what a command waits for: `what`, or that the file is sent."""
         if self._done < self._total:
-            return f"{self.file} to be sent: {self._done} of {self._total} bytes"
-        return f"{self.file}:{self.function} to run"
+            return f"{self.file} to be sent ({self._done} of {self._total} bytes)"
+        return what
 
 
 async def start(
@@ -81,7 +81,7 @@ async def start(
         restart=restart,
         progress=code.progress,
     )
-    with session.waiting(code.awaited):
+    with session.waiting(lambda: code.awaited(f"{module} to start {code.file}:{code.function}")):
         name = await _answered(starting)
     notify(f"{module}: node {name} runs")
 
@@ -105,7 +105,15 @@ async def restart(session: Session, module: ModuleName, node: NodeName) -> None:
 async def swap(
     session: Session,
     module: ModuleName,
-    old: Annotated[str, typer.Argument(metavar="OLD", help="The node to replace.", show_default=False)],
+    old: Annotated[
+        str,
+        typer.Argument(
+            metavar="OLD",
+            autocompletion=complete_node_of_module,
+            help="The node to replace.",
+            show_default=False,
+        ),
+    ],
     target: Target,
     *,
     send: Send = False,
@@ -126,7 +134,7 @@ async def swap(
     swapping = nodes.swap(
         old, code.file, code.function, code.name, code=code.sent, partial=partial, progress=code.progress
     )
-    with session.waiting(code.awaited):
+    with session.waiting(lambda: code.awaited(f"{module} to swap {old}")):
         result = await _answered(swapping)
     if not result.cleaned_up:
         notify(f"the old node still cleans up: it hangs, and can't publish any more; see the log of {module}")
@@ -153,7 +161,9 @@ def _line(topic: r2p.TopicPause) -> str:
     if topic.period is None:
         return text
     missed = max(0, round(topic.pause / topic.period) - 1)
-    return f"{text}, {f'{missed} periods' if missed else 'the period is'} {'of ' * bool(missed)}{_ms(topic.period)}"
+    return (
+        f"{text}, {f'{missed} periods of' if missed else 'the period is'} {_ms(topic.period)}{' missed' * bool(missed)}"
+    )
 
 
 def _ms(seconds: float) -> str:
