@@ -12,6 +12,7 @@ ERASED = 0xFF
 """The value of each byte after an erasure; writing can only clear bits."""
 
 _NO_PAGE = -1
+_HALF_WORD = 2  # bytes that are written at once
 
 
 class FlashTimes(msgspec.Struct, frozen=True):
@@ -47,7 +48,7 @@ class MemoryMap(msgspec.Struct, frozen=True, kw_only=True):
     least_stack: int = 512
 
 
-class Write(msgspec.Struct, frozen=True):
+class PageWrite(msgspec.Struct, frozen=True):
     """The write of a page: when it starts, when its erasure ends, when all of it ends (ns), and what was there."""
 
     start: int
@@ -72,7 +73,7 @@ class Flash:
         """Pages erased."""
         self.end = 0
         """When the last operation ends, monotonic ns."""
-        self._writes: list[Write] = []
+        self._writes: list[PageWrite] = []
 
     def begin(self, now: int) -> None:
         """Begin with the operations for one message; those before are over."""
@@ -101,7 +102,7 @@ class Flash:
         for worn, bits in self.worn.items():
             if address <= worn < address + len(new):
                 self.data[worn - self.memory.flash_start] &= ~bits & 0xFF
-        self._writes.append(Write(start, erased, self.end, at, old, bytes(self.data[at : at + len(new)])))
+        self._writes.append(PageWrite(start, erased, self.end, at, old, bytes(self.data[at : at + len(new)])))
         return self._writes[-1].new == new
 
     def cut_power(self, now: int) -> None:
@@ -114,7 +115,7 @@ class Flash:
         self.end = now
 
 
-def _interrupted(write: Write, now: int) -> bytes:
+def _interrupted(write: PageWrite, now: int) -> bytes:
     """Return the content of a page whose write was cut at `now`."""
     if now <= write.start:
         return write.old
@@ -124,6 +125,7 @@ def _interrupted(write: Write, now: int) -> bytes:
         return bytes([ERASED]) * done + write.old[done:]
     before = bytes([ERASED]) * size if write.erased > write.start else write.old
     done = size * (now - write.erased) // (write.end - write.erased)
+    done -= done % _HALF_WORD
     return write.new[:done] + before[done:]
 
 
