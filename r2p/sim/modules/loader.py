@@ -108,7 +108,8 @@ class EmulatedLoader:
         self._queue: deque[tuple[int, Loader | None]] = deque()
         self._ready: list[bytes] = []  # answers to the present message
         self._out: deque[tuple[int, bytes]] = deque()
-        self._polled_at = 0
+        self._polled_at = 0  # when it found its queue empty
+        self._next_at = 0  # when it handles the next message
         self._base = 0
         self._ram_free_to = self.memory.ram_end
         self._steps: _Steps | None = None
@@ -155,16 +156,14 @@ class EmulatedLoader:
         elif len(self._queue) >= QUEUE:
             self.drops["loader queue full"] += 1
         else:
-            if not self._queue and now > self._polled_at:
-                self._polled_at += (now - self._polled_at - 1) // _POLL * _POLL
+            if not self._queue:
+                self._next_at = self._polled_at + max(1, -(-(now - self._polled_at) // _POLL)) * _POLL
             self._queue.append((self.requests, _decoded(data)))
 
     def poll(self, now: int) -> list[bytes]:
         """Carry out due work, and return the answers that are due: call it at `next_deadline()`."""
-        while self._queue and not self.fault and now >= self._polled_at + _POLL:
-            self._polled_at += _POLL
-            while self._queue and not self.fault:
-                self._handle(*self._queue.popleft())
+        while self._queue and not self.fault and now >= self._next_at:
+            self._handle(*self._queue.popleft())
         answers = []
         while self._out and self._out[0][0] <= now:
             answers.append(self._out.popleft()[1])
@@ -172,15 +171,15 @@ class EmulatedLoader:
 
     def next_deadline(self) -> int | None:
         """Return when to call `poll`."""
-        if self._out:
-            return self._out[0][0]
-        return self._polled_at + _POLL if self._queue and not self.fault else None
+        times = [self._out[0][0]] if self._out else []
+        times += [self._next_at] if self._queue and not self.fault else []
+        return min(times, default=None)
 
     def _handle(self, number: int, message: Loader | None) -> None:
         """Carry out one message; its answers go out as soon as the flash is written."""
         if self._steps is None:
             return
-        self.flash.begin(self._polled_at)
+        self.flash.begin(self._next_at)
         try:
             if number in self.faults.refused:
                 self._steps.throw(_Refused(0))
@@ -189,7 +188,7 @@ class EmulatedLoader:
         except (EndlessList, _AssertionFails) as error:
             self.fault = str(error)
             self._ready.clear()
-        self._polled_at = self.flash.end
+        self._polled_at = self._next_at = self.flash.end
         self._out.extend((self.flash.end, data) for data in self._ready)
         self._ready.clear()
 

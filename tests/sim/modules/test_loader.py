@@ -200,6 +200,20 @@ def test_a_power_cut_while_a_parameter_is_saved_may_cost_the_app(late: int, foun
     assert peer.apps() == found
 
 
+def test_a_power_cut_while_the_first_of_two_messages_is_written_leaves_it_half_done() -> None:
+    """The second one waits in the queue until then."""
+    peer = LinePeer(module(SMALL_PAGES, BOARD))
+    peer.run(load(text=bytes(64)), ms=100)
+    for message in (BeginLoader(), RemoveLast()):
+        assert peer.ask(message) == [Ack()]
+    peer.send(EndLoader())
+    peer.send(BeginLoader())
+    peer.wait(20)
+    peer.power_on()
+    start = bytes(peer.module.loader.flash.data[:4])
+    assert start == b"\xff" * 4, "neither the app's signature nor the one that marks it as removed"
+
+
 def test_worn_flash_halts_the_module_when_the_page_is_written() -> None:
     peer = LinePeer(module())
     peer.module.loader.flash.worn[0x0800F450] = 0b1000_0001
