@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import r2p
-from r2p.tools.completion import beginning, on_network
+from r2p.tools.completion import beginning, modules, on_network
 from r2p.tools.param.targets import Infos, meant
 from r2p.tools.session import Session
 
@@ -15,13 +15,13 @@ _ANSWERS = 0.5  # seconds to wait for the answers of modules while a shell compl
 
 
 def complete_target(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Completions for a reference: modules and nodes with parameters, and their parameters behind a node and a dot."""
+    """Completions for a reference: modules, nodes with parameters, and parameters behind a node and a dot."""
 
     async def references(session: Session) -> list[str]:
         infos = await _infos(session)
         nodes = [f"{info.module}/{info.node}" for info in infos]
         begun = [info.full_name for info in infos if incomplete.startswith(f"{info.module}/{info.node}.")]
-        return begun or [*(info.module for info in infos), *nodes]
+        return begun or [*await modules(session), *nodes]
 
     return beginning(incomplete, on_network(ctx, references))
 
@@ -29,10 +29,10 @@ def complete_target(ctx: typer.Context, incomplete: str) -> list[str]:
 def complete_module_with_parameters(ctx: typer.Context, incomplete: str) -> list[str]:
     """Completions for a module that has parameters."""
 
-    async def modules(session: Session) -> list[str]:
+    async def with_parameters(session: Session) -> list[str]:
         return [info.module for info in await _infos(session)]
 
-    return beginning(incomplete, on_network(ctx, modules))
+    return beginning(incomplete, on_network(ctx, with_parameters))
 
 
 def complete_name(ctx: typer.Context, incomplete: str) -> list[str]:

@@ -18,6 +18,7 @@ from r2p.tools.completion import complete_type
 from r2p.tools.module import unknown_module
 from r2p.tools.output import Output, flatten, notify
 from r2p.tools.param.targets import similar
+from r2p.tools.param.texts import put_all
 from r2p.tools.session import Session, TimedOut, UsageError, wait_until
 from r2p.tools.types import Types, type_name
 from r2p.tools.values import parse, pick, to_plain
@@ -121,9 +122,8 @@ async def get(area: ConfigArea, output: Output, names: list[str]) -> None:
         return
     message = _decoded(area, area.cls, await area.read())
     values = {name: _picked(message, name) for name in names} or to_plain(message)
-    for name, value in values.items():
-        text = f"{area.module} {area.app}.{name} = {json.dumps(value, ensure_ascii=False)}"
-        await output.put({"module": area.module, "app": area.app, "name": name, "value": value}, text)
+    rows = [{"module": area.module, "app": area.app, "name": name, "value": value} for name, value in values.items()]
+    await put_all(output, rows, [f"{_name(row)} = {_text(row['value'])}" for row in rows])
 
 
 async def set_(area: ConfigArea, output: Output, words: list[str]) -> None:
@@ -143,11 +143,22 @@ async def set_(area: ConfigArea, output: Output, words: list[str]) -> None:
         await _put_bytes(area, output, after)
         return
     old, new = (flatten(to_plain(_decoded(area, area.cls, data))) for data in (before, after))
-    for name, value in new.items():
-        if value != old[name]:
-            text = f"{area.module} {area.app}.{name} = {json.dumps(value)} (was {json.dumps(old[name])})"
-            record = {"module": area.module, "app": area.app, "name": name, "value": value, "before": old[name]}
-            await output.put(record, text)
+    rows = [
+        {"module": area.module, "app": area.app, "name": name, "value": value, "before": old[name]}
+        for name, value in new.items()
+        if value != old[name]
+    ]
+    texts = [f"{_name(row)} = {_text(row['value'])} (was {_text(row['before'])})" for row in rows]
+    if rows:
+        await put_all(output, rows, texts)
+
+
+def _name(row: dict[str, Any]) -> str:
+    return f"{row['module']} {row['app']}.{row['name']}"
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
 
 
 # The module

@@ -12,7 +12,20 @@ from r2p.tools.param import firmware as on_firmware
 from r2p.tools.param.arguments import MaybeTarget, Names, Target
 from r2p.tools.param.firmware import App, As, Raw, Reboot
 from r2p.tools.param.targets import find, find_modules, meant
-from r2p.tools.param.texts import COLUMNS, FIELDS, details, dumped, plain, record, row, shown, with_unit
+from r2p.tools.param.texts import (
+    COLUMNS,
+    FIELDS,
+    brief,
+    details,
+    dumped,
+    plain,
+    put_all,
+    record,
+    row,
+    shown,
+    value_text,
+    with_unit,
+)
 from r2p.tools.session import Session, patience
 
 _AGAIN = 2.0  # seconds until a module that did not answer is asked again
@@ -69,9 +82,9 @@ async def get(
             await on_firmware.get(area, output, names or [])
         return
     on_firmware.check_unused(as_, raw, reboot=reboot)
-    for info in await find(session, target, names or []):
-        brief = {"module": info.module, "node": info.node, "name": info.name, "value": plain(info.value)}
-        await output.put(brief | {"unit": info.unit}, f"{info.full_name} = {with_unit(info, info.value)}")
+    infos = await find(session, target, names or [])
+    rows = [brief(info) | {"value": plain(info.value), "unit": info.unit} for info in infos]
+    await put_all(output, rows, [f"{info.full_name} = {with_unit(info, info.value)}" for info in infos])
 
 
 async def info(session: Session, target: Target, names: Names = None, *, format: Format = None) -> None:
@@ -81,8 +94,8 @@ async def info(session: Session, target: Target, names: Names = None, *, format:
     what it is for.
     """
     output = Output(format)
-    for each in await find(session, target, names or []):
-        await output.put(record(each), details(each), wrap=True)
+    infos = await find(session, target, names or [])
+    await put_all(output, list(map(record, infos)), list(map(details, infos)))
 
 
 async def dump(session: Session, target: MaybeTarget = None) -> None:
@@ -179,8 +192,9 @@ class _ChangePrinter:
         stamp = session.node.now()
         was = "new" if before is None else f"was {shown(info, before)}"
         text = f"{clock_text(stamp)} {info.full_name} = {with_unit(info, info.value)} ({was}; {info.origin})"
-        changed: dict[str, Any] = {"stamp": stamp, "module": info.module, "node": info.node, "name": info.name}
-        changed |= {"value": plain(info.value), "before": plain(before), "unit": info.unit, "origin": info.origin}
+        written = value_text if self._output.format == "csv" else plain  # of one column, whatever has changed
+        changed = {"stamp": stamp} | brief(info) | {"value": written(info.value)}
+        changed |= {"before": None if before is None else written(before), "unit": info.unit, "origin": info.origin}
         await self._output.put(changed, text)
         if self._left is not None:
             self._left -= 1

@@ -7,9 +7,10 @@ import tomli_w
 
 import r2p
 from r2p.log_lines import printable
+from r2p.tools.output import Output
 from r2p.tools.session import UsageError
 
-COLUMNS = ["node", "name", "value", "unit", "range", "origin"]
+COLUMNS = ["node", "name", "value", "range", "origin"]
 """The columns of a table for people."""
 
 FIELDS = [
@@ -19,9 +20,26 @@ FIELDS = [
 """The keys of a record for programs, in their order."""
 
 
+_WIDE = 32  # characters of a cell of that table; `info` shows all
+
+
 def record(info: r2p.ParameterInfo) -> dict[str, Any]:
     """Return a parameter as values for JSON."""
     return {name: plain(getattr(info, name)) for name in FIELDS}
+
+
+def brief(info: r2p.ParameterInfo) -> dict[str, Any]:
+    """Return what names a parameter, as values for JSON."""
+    return {"module": info.module, "node": info.node, "name": info.name}
+
+
+async def put_all(output: Output, rows: list[dict[str, Any]], texts: list[str]) -> None:
+    """Write records with the same keys; at a terminal as these texts, which are wrapped."""
+    if output.format != "text":
+        await output.table(rows, list(rows[0]))
+        return
+    for record, text in zip(rows, texts, strict=True):
+        await output.put(record, text, wrap=True)
 
 
 def row(info: r2p.ParameterInfo) -> dict[str, Any]:
@@ -29,11 +47,14 @@ def row(info: r2p.ParameterInfo) -> dict[str, Any]:
     return {
         "node": f"{info.module}/{info.node}",
         "name": info.name,
-        "value": shown(info, info.value),
-        "unit": info.unit or None,
-        "range": range_text(info) or None,
+        "value": _cut(with_unit(info, info.value)),
+        "range": _cut(range_text(info)) or None,
         "origin": info.origin,
     }
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _WIDE else f"{text[: _WIDE - 4]} ..."
 
 
 def plain(value: Any) -> Any:

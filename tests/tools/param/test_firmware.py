@@ -122,6 +122,18 @@ async def test_bytes(capsys: pytest.CaptureFixture[str]) -> None:
     }
 
 
+async def test_behind_two_gateways_and_a_bus(config: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async with pid() as (power, _):
+        near = r2p.Module("GW1", via=["memory:lab", "sim:bus"], bridge=True)
+        far = r2p.Module("GW2", via=["sim:bus", power.wire()], bridge=True)
+        async with near, far, tool() as session:
+            await asyncio.sleep(5)
+            await set_(session, "IMU1", ["kp=0.75"], firmware="PID", as_=config, reboot=True)
+            assert power.module.flags == 2
+    (row,) = printed(capsys)
+    assert (row["name"], row["value"], row["before"]) == ("kp", 0.75, 0.5)
+
+
 async def test_a_module_that_is_not_in_its_boot_loader_is_left_alone(config: str) -> None:
     async with pid() as (power, session):
         with pytest.raises(r2p.Error, match=r"IMU1 is running: its parameters can be read in its boot loader only"):

@@ -82,12 +82,12 @@ async def test_list_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: 
     async with robot(drive), tool() as session:
         await list_(session)
     assert capsys.readouterr().out.splitlines() == [
-        "NODE       NAME         VALUE       UNIT       RANGE        ORIGIN",
-        "BOT/drive  kp           0.5         V/(rad/s)  0.0 to 10.0  code",
-        "BOT/drive  limits.left  [1, 2]                              code",
-        "BOT/drive  mode         SLOW                   SLOW, FAST   code",
-        'BOT/drive  serial       "a\\u001bb"             read-only    code',
-        "BOT/drive  top          inf                                 code",
+        "NODE       NAME         VALUE          RANGE        ORIGIN",
+        "BOT/drive  kp           0.5 V/(rad/s)  0.0 to 10.0  code",
+        "BOT/drive  limits.left  [1, 2]                      code",
+        "BOT/drive  mode         SLOW           SLOW, FAST   code",
+        'BOT/drive  serial       "a\\u001bb"     read-only    code',
+        "BOT/drive  top          inf                         code",
     ]
 
 
