@@ -14,7 +14,8 @@ from r2p.codecs.loader import FLAGS_WORD, SIZE, LinkingAddresses, LinkingSetup
 from r2p.loader import procedures
 from r2p.loader.procedures import FLAGS_SIZE, AppListing, LinkFunction, flags_are_enabled, with_enabled
 from r2p.loader.session import PATIENCE, LoaderError, LoaderFault, LoaderSession, LoaderSilent, Procedure
-from r2p.names import LOADER_PREFIX, module_path
+from r2p.names import LOADER_PREFIX, NODE_MAX, module_path
+from r2p.units import SECOND
 
 ORDER_TIMEOUT = 10.0
 """Seconds in which a module obeys BOOTLOAD or REBOOT, and shows it: firmware with many topics sends ALIVE rarely."""
@@ -23,8 +24,9 @@ _FIRST_STATE = 1.0  # seconds to learn the module's state before the first order
 _REPEAT = 1.0  # seconds between two orders
 _RESTARTS = 3  # orders to restart a loader, which shows nothing: its state is the same before and after
 _POLL = 0.02  # seconds between two looks at what is known of the module
+_QUEUE = 4  # messages, as many as a loader holds
+_LEAVES = 5.0  # seconds in which a tool that was killed is forgotten
 _TRIES = 3  # of what may be begun again: reading, and setting what is read back
-_SECOND = 1_000_000_000  # ns
 
 T = TypeVar("T")
 
@@ -59,13 +61,18 @@ class LoaderClient:
         self._changed = asyncio.Event()
         self._fresh = False  # it was restarted, and has loaded nothing since
         self._denied = ""  # why a gateway does not forward an order
-        self._node: r2p.Node | None = None
-        self._ready = asyncio.Event()
+        self._opened = asyncio.Event()
+        self._subscriber: r2p.Subscriber[LoaderMessage] | None = None
 
     async def __aenter__(self) -> Self:
-        self._node = self._module.start(self._listen, name=f"loader_{self.name.replace('/', '_')}"[:64])
+        """Open the loader's topic. Raises TypeMismatch if the program uses it with another type."""
+        node = self._module.start(self._listen, name=self._node_name)
+        try:
+            self._publisher = node.advertise(self.topic, LoaderMessage)
+            self._subscriber = node.subscribe(self.topic, LoaderMessage, queue=_QUEUE, lossy=True)
+        finally:
+            self._opened.set()
         self._events = asyncio.create_task(self._watch(self._module.events()))
-        await self._ready.wait()
         return self
 
     async def __aexit__(
@@ -73,8 +80,15 @@ class LoaderClient:
     ) -> None:
         self._events.cancel()
         self._session.abandon()
-        self._subscriber.close()
         self._publisher.close()
+        if self._subscriber is not None:
+            self._subscriber.close()  # ends the node
+        while self._module.nodes[self._node_name].running:  # else another client could not start one of its name
+            await asyncio.sleep(0)
+
+    @property
+    def _node_name(self) -> str:
+        return f"loader_{self.name.replace('/', '_')}"[:NODE_MAX]
 
     @property
     def topic(self) -> str:
@@ -122,7 +136,7 @@ class LoaderClient:
         elif restart and not self._fresh:
             await self._restart()
             self.restarted = self._fresh = True
-        self._check_alone()
+        await self._check_alone()
 
     async def leave(self) -> None:
         """Restart the module (REBOOT): its enabled apps start. Raises LoaderSilent if it does not come back."""
@@ -177,13 +191,16 @@ class LoaderClient:
             await asyncio.sleep(_POLL)
         return True
 
-    def _check_alone(self) -> None:
-        """Raise LoaderError if another tool uses the loader: the answers to both would be the same."""
+    async def _check_alone(self) -> None:
+        """Raise LoaderError if another tool uses the loader: it would take the answers for its own."""
+        if not await self._until(lambda: not self._others(), _LEAVES):
+            others = ", ".join(sorted(self._others()))
+            raise LoaderError(f"{others} uses the loader of {self.name} as well: end that first")
+
+    def _others(self) -> set[str]:
         view = self._module.network.topics().get(self.topic)
-        others = {each.module for each in view.publishers if each.link} if view is not None else set()
-        others -= {"", self.name}
-        if others:
-            raise LoaderError(f"{', '.join(sorted(others))} uses the loader of {self.name} as well: end that first")
+        found = {each.module for each in view.publishers if each.link} if view is not None else set()
+        return found - {"", self.name}
 
     # What the loader does
 
@@ -259,7 +276,7 @@ class LoaderClient:
                     break
                 deadline = session.next_deadline()
                 assert deadline is not None
-                await self._answer(deadline / _SECOND - loop.time())
+                await self._answer(deadline / SECOND - loop.time())
                 session.poll(self._now())
         finally:
             session.abandon()
@@ -278,13 +295,13 @@ class LoaderClient:
             return
 
     def _now(self) -> int:
-        return round(asyncio.get_running_loop().time() * _SECOND)
+        return round(asyncio.get_running_loop().time() * SECOND)
 
     async def _listen(self, node: r2p.Node) -> None:
         """Give the session what comes from the loader: the node of this client."""
-        self._publisher = node.advertise(self.topic, LoaderMessage)
-        self._subscriber = node.subscribe(self.topic, LoaderMessage, queue=4, lossy=True)
-        self._ready.set()
+        await self._opened.wait()
+        if self._subscriber is None:
+            return
         async for sample in self._subscriber.samples():
             if sample.source.link:  # not a message of this client: both directions look alike
                 self._session.receive(sample.data, self._now())

@@ -6,7 +6,7 @@ other message, once it has been carried out, would be refused when it comes agai
 """
 
 import contextlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import msgspec
 
@@ -201,9 +201,9 @@ def _set_part(app: str, offset: int, data: bytes) -> Procedure[None]:
     yield from _ask(EndSetparam(), Ack)
 
 
-def _parts(offset: int, length: int) -> list[range]:
+def _parts(offset: int, length: int) -> Iterator[range]:
     stop = offset + length
-    return [range(begin, min(begin + PARAM_MAX, stop)) for begin in range(offset, stop, PARAM_MAX)]
+    return (range(begin, min(begin + PARAM_MAX, stop)) for begin in range(offset, stop, PARAM_MAX))
 
 
 def flags_are_enabled(data: bytes) -> bool:

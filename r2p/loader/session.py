@@ -19,13 +19,13 @@ import msgspec
 from r2p.codecs import UnknownType
 from r2p.codecs.loader import Ack, Loader, Nack, decode, encode
 from r2p.errors import DecodeError, Error
+from r2p.units import SECOND
 
 PATIENCE = 1.0
 """Seconds in which a loader answers: it polls each 10 ms, and a flash page takes up to 100 ms."""
 PATIENCE_REMOVE_ALL = 15.0
 """Seconds in which a loader has erased all pages of its flash: up to 68, in 3 to 6 s."""
 
-_SECOND = 1_000_000_000  # ns
 
 # What the firmware of 2014 means by the line of a NACK. Other firmware has other lines, so these are hints only.
 _NACK_HINTS = {
@@ -224,14 +224,14 @@ class LoaderSession:
             self._out.append(encode(step.message))
             self._sends += 1
         if step.pause:
-            self._deadline = now + round(step.pause * _SECOND)
+            self._deadline = now + round(step.pause * SECOND)
             return
         self._owed += 1
         self._wait(now)
 
     def _wait(self, now: int) -> None:
         patience = self._step.patience if self._step is not None else 0.0
-        self._deadline = now + round((patience or self._patience) * _SECOND)
+        self._deadline = now + round((patience or self._patience) * SECOND)
 
 
 def expect(answer: Loader, kind: type[T], asked: str) -> T:

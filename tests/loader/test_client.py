@@ -11,7 +11,8 @@ import r2p
 from r2p.codecs.loader import LinkingAddresses, LinkingSetup
 from r2p.loader import LoaderClient, LoaderError, LoaderSilent
 from r2p.sim.modules import EmulatedLoader, LoaderFaults
-from tests.loader.rig import client
+from r2p.msg import Led
+from tests.loader.rig import board, client
 from tests.loader.test_session import CONFIG, link
 
 pytestmark = pytest.mark.virtual_time
@@ -121,4 +122,19 @@ async def test_two_tools_do_not_share_a_loader() -> None:
     ):
         await asyncio.sleep(1)
         with pytest.raises(LoaderError, match="PC2 uses the loader of IMU1 as well"):
-            first._check_alone()
+            await first._check_alone()
+
+
+async def test_one_client_after_the_other() -> None:
+    async with board() as (_, module):
+        for _ in range(3):
+            async with LoaderClient(module, "IMU1") as loader:
+                await loader.enter()
+        node = module.start(hold)
+        node.advertise("BOOT_IMU2", Led)
+        with pytest.raises(r2p.TypeMismatch):
+            await LoaderClient(module, "IMU2").__aenter__()
+
+
+async def hold(node: r2p.Node) -> None:
+    await asyncio.Event().wait()
