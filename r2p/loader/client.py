@@ -25,6 +25,7 @@ _REPEAT = 1.0  # seconds between two orders
 _RESTARTS = 3  # orders to restart a loader, which shows nothing: its state is the same before and after
 _POLL = 0.02  # seconds between two looks at what is known of the module
 _QUEUE = 4  # messages, as many as a loader holds
+_ENDS = 1.0  # seconds in which a node that has nothing more to do has ended
 _LEAVES = 5.0  # seconds in which a tool that was killed is forgotten
 _TRIES = 3  # of what may be begun again: reading, and setting what is read back
 
@@ -60,6 +61,7 @@ class LoaderClient:
         self._session = LoaderSession(patience)
         self._changed = asyncio.Event()
         self._fresh = False  # it was restarted, and has loaded nothing since
+        self._ordered_at = 0.0  # when the last order was sent, by the event loop's clock
         self._denied = ""  # why a gateway does not forward an order
         self._opened = asyncio.Event()
         self._subscriber: r2p.Subscriber[LoaderMessage] | None = None
@@ -83,8 +85,8 @@ class LoaderClient:
         self._publisher.close()
         if self._subscriber is not None:
             self._subscriber.close()  # ends the node
-        while self._module.nodes[self._node_name].running:  # else another client could not start one of its name
-            await asyncio.sleep(0)
+        # Else the next client could not start a node of this name.
+        await self._until(lambda: not self._module.nodes[self._node_name].running, _ENDS)
 
     @property
     def _node_name(self) -> str:
@@ -95,6 +97,11 @@ class LoaderClient:
         """The loader's topic: `BOOT_IMU1`, and `robot1/BOOT_IMU1` of `robot1/IMU1`."""
         namespace, slash, name = self.name.rpartition("/")
         return f"{namespace}{slash}{LOADER_PREFIX}{name}"
+
+    @property
+    def repeated(self) -> int:
+        """Messages that were sent again, for want of an answer."""
+        return self._session.repeated
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -122,8 +129,8 @@ class LoaderClient:
         """Restart the module into its loader (BOOTLOAD), and wait until it is there. All its nodes end.
 
         A module that is there already stays as it is; with `restart` its loader is restarted, which frees the RAM that
-        loads have used since its last start by this client. Raises LoaderError for a module that has no loader, LoaderSilent if it does not get
-        there.
+        loads have used since its last start by this client. Raises LoaderError for a module that has no loader, and
+        LoaderSilent if it does not get there.
         """
         self._module.query()
         await self._until(lambda: self.view() is not None, _FIRST_STATE)  # firmware may announce itself later, or never
@@ -131,7 +138,7 @@ class LoaderClient:
         if view is not None and not view.has_loader:
             raise LoaderError(f"{self.name} is an r2p module, a program without a boot loader: apps are for firmware")
         if view is None or view.state != "boot":
-            await self._order(r2p.Command.BOOTLOAD, lambda _: self._state() == "boot")
+            await self._order(r2p.Command.BOOTLOAD, lambda: self._state() == "boot")
             self.restarted = self._fresh = True
         elif restart and not self._fresh:
             await self._restart()
@@ -140,21 +147,21 @@ class LoaderClient:
 
     async def leave(self) -> None:
         """Restart the module (REBOOT): its enabled apps start. Raises LoaderSilent if it does not come back."""
-        await self._order(r2p.Command.REBOOT, lambda _: self._state() not in ("boot", ""))
+        await self._order(r2p.Command.REBOOT, lambda: self._state() not in ("boot", ""))
 
     def _state(self) -> str:
         view = self.view()
         return "" if view is None else view.state
 
-    async def _order(self, order: r2p.Command, obeyed: Callable[[float], bool]) -> None:
-        """Send an order until the module shows that it has obeyed; `obeyed` gets the time of the last order."""
+    async def _order(self, order: r2p.Command, obeyed: Callable[[], bool]) -> None:
+        """Send an order until the module shows that it has obeyed."""
         loop = asyncio.get_running_loop()
         began = loop.time()
         self._denied = ""
         while loop.time() - began < ORDER_TIMEOUT:
             self._module.command(order, self.name)
-            sent_at = loop.time()
-            if await self._until(lambda sent_at=sent_at: bool(self._denied) or obeyed(sent_at), _REPEAT):  # type: ignore[misc]
+            self._ordered_at = loop.time()
+            if await self._until(lambda: bool(self._denied) or obeyed(), _REPEAT):
                 if self._denied:
                     raise LoaderError(self._denied)
                 return
@@ -171,16 +178,18 @@ class LoaderClient:
 
     async def _restart(self) -> None:
         """Restart the loader. It shows nothing but an ALIVE, so the order is sent several times."""
-        loop = asyncio.get_running_loop()
-
-        def heard_since(sent_at: float) -> bool:
-            view = self.view()
-            return view is not None and view.state == "boot" and loop.time() - view.age > sent_at
-
         for _ in range(_RESTARTS - 1):
             self._module.command(r2p.Command.BOOTLOAD, self.name)
             await asyncio.sleep(_REPEAT / 5)
-        await self._order(r2p.Command.BOOTLOAD, heard_since)
+        await self._order(r2p.Command.BOOTLOAD, self._heard_since_order)
+
+    def _heard_since_order(self) -> bool:
+        view = self.view()
+        return (
+            view is not None
+            and view.state == "boot"
+            and asyncio.get_running_loop().time() - view.age > self._ordered_at
+        )
 
     async def _until(self, condition: Callable[[], bool], timeout: float) -> bool:
         loop = asyncio.get_running_loop()

@@ -108,7 +108,9 @@ class Deployment:
         flags = await self._client.get(app.name, FLAGS_WORD, FLAGS_SIZE)
         length = app.outcome.cfglen
         if length > app.setup.pgmlen:  # a number from the wire, or of damaged flash
-            self._report(f"{app.name}: its config area would have {length} bytes, more than its program: it is not kept")
+            self._report(
+                f"{app.name}: its config area would have {length} bytes, more than its program: it is not kept"
+            )
             length = 0
         config = await self._client.get(app.name, 0, length) if length else b""
         return _KeptState(flags, config)
@@ -199,7 +201,8 @@ class Deployment:
         """Return the error with the state of the module, and what to do."""
         module, done = self._client.name, [each.app.name for each in self._loaded]
         rest = [app.name for app in self._apps if app.name not in done]
-        text = f"{error}. {module} was left in its boot loader, without {', '.join(rest) or 'the last change'}"
+        link = "" if self._client.connected else ", and its link is down"
+        text = f"{error}{link}. {module} was left in its boot loader, without {', '.join(rest) or 'the last change'}"
         text += f" and with {', '.join(done)}" if done else ""
         if self._erased:
             lost = {name: state.config.hex() for name, state in self._kept.items() if name in rest and state.config}

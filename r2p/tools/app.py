@@ -227,7 +227,10 @@ async def _client(
                 if reboot:
                     await _reboot(session, client)
             finally:
-                if client.restarted and client.is_there:
+                if session.verbose:
+                    dropped = "".join(f", {count} dropped ({reason})" for reason, count in client.dropped.items())
+                    notify(f"{module}: {client.repeated} messages were repeated{dropped}")
+                if client.restarted and client.is_there and client.connected:
                     notify(f"{module} stays in its boot loader; r2p module reboot {module} starts its enabled apps")
     except LoaderSilent as error:
         raise TimedOut(str(error)) from error

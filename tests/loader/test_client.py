@@ -10,8 +10,8 @@ import pytest
 import r2p
 from r2p.codecs.loader import LinkingAddresses, LinkingSetup
 from r2p.loader import LoaderClient, LoaderError, LoaderSilent
-from r2p.sim.modules import EmulatedLoader, LoaderFaults
 from r2p.msg import Led
+from r2p.sim.modules import EmulatedLoader, LoaderFaults
 from tests.loader.rig import board, client
 from tests.loader.test_session import CONFIG, link
 
