@@ -135,7 +135,9 @@ def _links(given: _Rules, option: str, via: list[str]) -> tuple[str, ...]:
     for pattern in given or ():
         if not any(_may_match(pattern, url) for url in via):
             names = ", ".join(_link_name(url) for url in via)
-            raise UsageError(f"{option}: {pattern!r} matches none of the links {names}")
+            hint = "; the links to clients of a tcp-listen: are tcp:ADDRESS:PORT, so give tcp"
+            served = hint if any(url.startswith("tcp-listen") for url in via) else ""
+            raise UsageError(f"{option}: {pattern!r} matches none of the links {names}{served}")
     return tuple(given or ())
 
 
