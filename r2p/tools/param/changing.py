@@ -20,7 +20,7 @@ from r2p.tools.param import firmware as on_firmware
 from r2p.tools.param.arguments import Assignments, MaybeTarget, ModuleName, Names, Target
 from r2p.tools.param.firmware import App, As, Raw, Reboot
 from r2p.tools.param.targets import Infos, find, find_modules, one_module, references, similar, with_name
-from r2p.tools.param.texts import brief, plain, put_all, shown, with_unit
+from r2p.tools.param.texts import assignment, brief, plain, put_all, shown
 from r2p.tools.session import Session, TimedOut, UsageError
 
 _NUMBER = re.compile(r"-\.?[0-9]|-inf", re.IGNORECASE)
@@ -60,7 +60,7 @@ async def set_(
     rows = [
         brief(info) | {"value": plain(value), "before": plain(info.value), "unit": info.unit} for info, value in values
     ]
-    texts = [f"{info.full_name} = {with_unit(info, value)} (was {shown(info, info.value)})" for info, value in values]
+    texts = [f"{assignment(info, value)} (was {shown(info, info.value)})" for info, value in values]
     await put_all(output, rows, texts)
 
 

@@ -15,6 +15,7 @@ from r2p.tools.param.targets import find, find_modules, meant
 from r2p.tools.param.texts import (
     COLUMNS,
     FIELDS,
+    assignment,
     brief,
     details,
     dumped,
@@ -24,7 +25,6 @@ from r2p.tools.param.texts import (
     row,
     shown,
     value_text,
-    with_unit,
 )
 from r2p.tools.session import Session, patience
 
@@ -84,7 +84,7 @@ async def get(
     on_firmware.check_unused(as_, raw, reboot=reboot)
     infos = await find(session, target, names or [])
     rows = [brief(info) | {"value": plain(info.value), "unit": info.unit} for info in infos]
-    await put_all(output, rows, [f"{info.full_name} = {with_unit(info, info.value)}" for info in infos])
+    await put_all(output, rows, [assignment(info, info.value) for info in infos])
 
 
 async def info(session: Session, target: Target, names: Names = None, *, format: Format = None) -> None:
@@ -191,7 +191,7 @@ class _ChangePrinter:
         self._received()
         stamp = session.node.now()
         was = "new" if before is None else f"was {shown(info, before)}"
-        text = f"{clock_text(stamp)} {info.full_name} = {with_unit(info, info.value)} ({was}; {info.origin})"
+        text = f"{clock_text(stamp)} {assignment(info, info.value)} ({was}; {info.origin})"
         written = value_text if self._output.format == "csv" else plain  # of one column, whatever has changed
         changed = {"stamp": stamp} | brief(info) | {"value": written(info.value)}
         changed |= {"before": None if before is None else written(before), "unit": info.unit, "origin": info.origin}

@@ -76,9 +76,14 @@ def shown(info: r2p.ParameterInfo, value: Any) -> str:
     return str(value) if info.choices else value_text(value)
 
 
+def assignment(info: r2p.ParameterInfo, value: Any) -> str:
+    """Return `MODULE/NODE.NAME = VALUE UNIT`, on one line."""
+    return f"{printable(info.full_name)} = {with_unit(info, value)}"
+
+
 def with_unit(info: r2p.ParameterInfo, value: Any) -> str:
     """Return a value with its unit."""
-    return f"{shown(info, value)} {info.unit}".rstrip()
+    return printable(f"{shown(info, value)} {info.unit}".rstrip())
 
 
 def range_text(info: r2p.ParameterInfo) -> str:
@@ -113,7 +118,7 @@ def details(info: r2p.ParameterInfo) -> str:
         "doc": info.doc,
         "problem": info.problem,
     }
-    return "".join(f"{name}: {value}\n" for name, value in found.items() if value)
+    return "".join(f"{name}: {printable(value)}\n" for name, value in found.items() if value)
 
 
 def dumped(infos: list[r2p.ParameterInfo]) -> str:
@@ -126,14 +131,18 @@ def dumped(infos: list[r2p.ParameterInfo]) -> str:
         module = info.module.rpartition("/")[2]
         if modules.setdefault(module, info.module) != info.module:
             raise UsageError(f"{modules[module]} and {info.module} are both {module} in a file: dump one of them")
-        if table != (table := f"[params.{module}.{info.node}]"):
+        if table != (table := f"[params.{_key(module)}.{_key(info.node)}]"):
             lines += ["", table]
         lines.append(_dumped_line(info))
     return "\n".join(lines) + "\n"
 
 
+def _key(name: str) -> str:
+    """Return a name as a key of TOML, in quotes where it needs them."""
+    return tomli_w.dumps({name: 0}).rpartition(" = ")[0]
+
+
 def _dumped_line(info: r2p.ParameterInfo) -> str:
-    key = tomli_w.dumps({info.name: 0}).rpartition(" = ")[0]
     about = ", ".join(filter(None, (info.unit, range_text(info))))
     comment = printable(": ".join(filter(None, (about, info.doc))))
-    return f"{key} = {value_text(info.value)}" + (f"  # {comment}" if comment else "")
+    return f"{_key(info.name)} = {value_text(info.value)}" + (f"  # {comment}" if comment else "")

@@ -70,6 +70,19 @@ async def test_a_module_that_does_not_answer() -> None:
             await list_(session, "BOT")
 
 
+async def test_a_module_that_falls_silent_while_it_is_set() -> None:
+    def cut(_: float) -> None:
+        network("lab").loss = 1.0
+
+    async def fragile(node: r2p.Node) -> None:
+        node.parameter("kp", 0.5, on_change=cut)
+        await asyncio.Event().wait()
+
+    async with robot(fragile), tool() as session:
+        with pytest.raises(TimedOut, match=r"BOT does not answer, .* whether it has made the change is unknown"):
+            await set_(session, "BOT/fragile", ["kp=0.7"])
+
+
 async def test_watching_goes_on_when_a_module_is_back(capsys: pytest.CaptureFixture[str]) -> None:
     async with tool() as session:
         async with robot(drive):

@@ -14,6 +14,7 @@ import pytest
 import r2p
 from r2p.tools.param.changing import load
 from r2p.tools.param.reading import dump, get, info, list_, watch
+from r2p.tools.param.texts import details, dumped, with_unit
 from r2p.tools.session import Settings, TimedOut, UsageError, join
 from tests.tools.rig import Firmware, printed, robot, tool
 
@@ -164,6 +165,17 @@ async def test_dump_is_what_load_and_params_read(capsys: pytest.CaptureFixture[s
             }
         },
     }
+
+
+def test_what_other_modules_send_stays_on_its_line() -> None:
+    hostile = r2p.ParameterInfo(
+        module="BOT", node='a]\n"', name="k\np", kind="str", value="v\n\x1b\"", default="", unit="\x1b\n", doc="\n[p]"
+    )  # fmt: skip
+    text = dumped([hostile])
+    assert tomllib.loads(text) == {"format": 1, "params": {"BOT": {'a]\n"': {"k\np": 'v\n\x1b"'}}}}
+    assert len(text.splitlines()) == 4
+    assert len(details(hostile).splitlines()) == 8
+    assert with_unit(hostile, "v").isprintable()
 
 
 async def test_watch_prints_changes(capsys: pytest.CaptureFixture[str]) -> None:
