@@ -56,8 +56,11 @@ class CodeLoader:
         return await self._load(file, function, lambda: self._run_file(path, source))
 
     async def load_sent(self, name: str, code: bytes, function: str) -> NodeFunction:
-        """Return a function of code that was sent, as a file of this name. It is kept in memory only. Raises Error."""
-        return await self._load(name, function, lambda: _run_sent(name, code))
+        """Return a function of code that was sent, as a file of this name in the directory. Raises Error.
+
+        It is kept in memory only.
+        """
+        return await self._load(name, function, lambda: self._run_sent(name, code))
 
     def _path(self, file: str) -> Path:
         try:
@@ -90,9 +93,7 @@ class CodeLoader:
         return found
 
     def _run_file(self, path: Path, source: bytes) -> types.ModuleType:
-        self._forget_changed()
-        if str(path.parent) not in sys.path:
-            sys.path.insert(0, str(path.parent))
+        self._prepare(path.parent)
         # A file named json.py must not replace the module that others have imported.
         known = sys.modules.get(path.stem)
         own = known is None or getattr(known, "__file__", None) == str(path)
@@ -100,6 +101,22 @@ class CodeLoader:
         spec = importlib.util.spec_from_file_location(name, path)
         assert spec is not None
         return _run(importlib.util.module_from_spec(spec), source, str(path))
+
+    def _run_sent(self, name: str, code: bytes) -> types.ModuleType:
+        self._prepare(self.directory)
+        filename = f"<sent {name}>"
+        lines = code.decode(errors="replace").splitlines(keepends=True)
+        linecache.cache[filename] = len(code), None, lines, filename  # tracebacks quote it
+        stem = "".join(each if each.isalnum() else "_" for each in name.removesuffix(".py"))
+        module = types.ModuleType(f"{_SENT}{stem}")
+        module.__file__ = filename
+        return _run(module, code, filename)
+
+    def _prepare(self, directory: Path) -> None:
+        """Let code that is loaded next import what is in a directory, as it is now."""
+        self._forget_changed()
+        if str(directory) not in sys.path:
+            sys.path.insert(0, str(directory))
 
     def _forget_changed(self) -> None:
         """Forget the modules of the directory whose files have changed, and those that have anything of them."""
@@ -162,16 +179,6 @@ def _read(path: Path) -> bytes:
     if len(source) > CODE_MAX:
         raise Error(f"{path} has more than {CODE_MAX >> 10} KiB: import its larger parts from other files")
     return source
-
-
-def _run_sent(name: str, code: bytes) -> types.ModuleType:
-    filename = f"<sent {name}>"
-    lines = code.decode(errors="replace").splitlines(keepends=True)
-    linecache.cache[filename] = len(code), None, lines, filename  # tracebacks quote it
-    stem = "".join(each if each.isalnum() else "_" for each in name.removesuffix(".py"))
-    module = types.ModuleType(f"{_SENT}{stem}")
-    module.__file__ = filename
-    return _run(module, code, filename)
 
 
 def _run(module: types.ModuleType, source: bytes, filename: str) -> types.ModuleType:

@@ -54,8 +54,8 @@ class NodeTable:
 
     @property
     def running(self) -> bool:
-        """Return whether any node runs."""
-        return any(each.running for each in self._all())
+        """Return whether any node runs, or may start again as a swap fails."""
+        return bool(self._swaps) or any(each.running for each in self._all())
 
     def _all(self) -> list[Supervisor]:
         """Return all nodes, also both of each swap."""
@@ -135,7 +135,7 @@ class NodeTable:
         # In a task of its own: the caller may be the old node, which ends in the swap.
         task = asyncio.get_running_loop().create_task(swap.run(), name=f"{self._module} swap")
         self._swaps[swap] = task
-        task.add_done_callback(lambda _task: self._swaps.pop(swap))
+        task.add_done_callback(lambda _task: self._swap_ended(swap))
         try:
             result = await asyncio.shield(task)
         except asyncio.CancelledError:
@@ -145,6 +145,10 @@ class NodeTable:
         if isinstance(result, Error):
             raise result
         return result
+
+    def _swap_ended(self, swap: NodeSwap) -> None:
+        del self._swaps[swap]
+        self.changed.set()
 
     def _replace(self, one: Supervisor, other: Supervisor) -> None:
         """Put a node into the place of another one, which may still clean up."""

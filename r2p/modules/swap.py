@@ -141,7 +141,10 @@ class NodeSwap:
         self.new.on_trial = False
         if self.interrupted:
             return self._interruption()
-        return SwapResult(self.new.node, await self._measure(ended_at), cleaned_up)
+        topics = await self._measure(ended_at)
+        self._replaced.followed.clear()  # else each node would keep all those before it in memory
+        self.old.node.replaced = ReplacedNode()
+        return SwapResult(self.new.node, topics, cleaned_up)
 
     async def _start_old(self) -> Error:
         """Start the old node again, as the new one has ended before it had taken over."""

@@ -273,6 +273,41 @@ async def test_code_is_sent_only_by_links_with_a_key(directory: Path, tmp_path: 
         assert bot.nodes["blink"].running
 
 
+@virtual_time
+async def test_each_hop_of_code_needs_a_key(directory: Path, tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    keys.create(key)
+    code = tmp_path / "blink.py"
+    for far, allowed in ((f"memory:f?key={key}", True), ("memory:g", False)):
+        async with AsyncExitStack() as stack:
+            bot = await stack.enter_async_context(host(directory, f"memory:n?key={key}"))
+            await stack.enter_async_context(r2p.Module("GW", via=[f"memory:n?key={key}", far], bridge=True))
+            nodes = await nodes_of(stack, far)
+            if allowed:
+                await nodes.start("blink.py", "blink", code=code)
+                assert bot.nodes["blink"].running
+                continue
+            with pytest.raises(r2p.ServiceError, match=r"GW refuses .*\(\?key=FILE\)"):
+                await nodes.start("blink.py", "blink", code=code)
+            assert not bot.nodes
+
+
+@virtual_time
+async def test_a_module_that_is_gone_in_the_middle_is_a_time_out(directory: Path) -> None:
+    write(directory / "slow.py", "import asyncio\n\nasync def wait(node):\n    await asyncio.sleep(60)\n")
+    async with AsyncExitStack() as stack:
+        async with host(directory) as bot:
+            nodes = await nodes_of(stack)
+            await nodes.start("blink.py", "blink")
+            swap = asyncio.create_task(nodes.swap("blink", "slow.py", "wait"))
+            await asyncio.sleep(1.0)
+            assert not swap.done()
+            for link in bot.links:
+                link.on_down("pulled out")
+        with pytest.raises((TimeoutError, r2p.Error), match="whether it has made the change is unknown"):
+            await swap
+
+
 def test_pieces_of_code_are_kept_within_limits() -> None:
     store = CodeStore()
 

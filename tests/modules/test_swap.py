@@ -175,6 +175,28 @@ async def test_publishers_that_wait_hold_back_until_the_old_node_has_cleaned_up(
         assert not result.node.handing_over
 
 
+@pytest.mark.parametrize("klass", [r2p.NonRealTime(stall=9.0), r2p.Sporadic(9.0)])
+async def test_what_waits_for_room_still_arrives_in_order(klass: Any) -> None:
+    def talk(first: int) -> Callable[[r2p.Node], Awaitable[None]]:
+        async def publish(node: r2p.Node) -> None:
+            leds: Any = node.advertise("leds", Led, klass)
+            await leds.publish(led(first))
+            await leds.publish(led(first + 1))
+            await hold(node)
+
+        return publish
+
+    async with local() as module, node_in(module) as test:
+        leds = test.subscribe("leds", Led, queue=1)
+        module.start(talk(1), name="talk")
+        await asyncio.sleep(0.1)
+        await module.swap("talk", talk(3))
+        got = [await leds.fetch(1.0) for _ in range(4)]
+        assert numbers(got) == [1, 2, 3, 4]
+        assert leds.lost == 0
+        assert next(iter(module.nodes["talk"].node.publishers)).sent == 4
+
+
 async def test_a_node_with_another_name_goes_on_with_the_numbers_of_late_publishers_too() -> None:
     async def new(node: r2p.Node) -> None:
         await asyncio.sleep(0.5)
@@ -324,6 +346,7 @@ async def test_a_new_node_that_crashes_while_the_old_one_cleans_up_starts_that_a
     starts: list[r2p.Node] = []
     async with local() as module:
         module.start(old, name="motor")
+        waiting = asyncio.create_task(module.wait())
         await asyncio.sleep(0.1)
         with pytest.raises(r2p.Error, match="the new node crashed: KeyError: 'port'; motor was started again"):
             await module.swap("motor", new, limits=QUICK)
@@ -331,6 +354,7 @@ async def test_a_new_node_that_crashes_while_the_old_one_cleans_up_starts_that_a
         assert len(starts) == 2
         assert module.nodes["motor"].node is starts[1]
         assert module.nodes["motor"].running
+        assert not waiting.done()
 
 
 def slow(node_started: list[str], which: str) -> Callable[[r2p.Node], Awaitable[None]]:
