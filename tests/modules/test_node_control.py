@@ -287,7 +287,7 @@ async def test_each_hop_of_code_needs_a_key(directory: Path, tmp_path: Path) -> 
                 await nodes.start("blink.py", "blink", code=code)
                 assert bot.nodes["blink"].running
                 continue
-            with pytest.raises(r2p.ServiceError, match=r"GW refuses .*\(\?key=FILE\)"):
+            with pytest.raises(r2p.ServiceError, match=r"GW passes no changes .*\(\?key=FILE\)"):
                 await nodes.start("blink.py", "blink", code=code)
             assert not bot.nodes
 
