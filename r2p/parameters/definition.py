@@ -43,9 +43,11 @@ _NUMBERS = (ParameterKind.INT, ParameterKind.FLOAT, ParameterKind.INTS, Paramete
 class ParameterInfo(ParameterRecord, frozen=True, kw_only=True):
     """A parameter of a module, as other modules and tools see it: `NetworkView.parameters`.
 
-    `kind` is "bool", "int", "float", "str", "enum", "ints" or "floats"; a value of an enum is its name, and `choices`
-    are all of them. `origin` says where the value comes from: "code", "saved file", "r2p.toml", "--params", "--param",
-    "params=", "run time" (set over the network, or by another node) or "program" (set by its own node).
+    `kind` is "bool", "int", "float", "str", "enum", "ints" or "floats". Values (`Plain`) are of that type, tuples of
+    int or float; that of an enum is its name, and `choices` are all of them.
+
+    `origin` says where the value comes from: "code", "saved file", "r2p.toml", "--params", "--param", "params=", "run
+    time" (set over the network, or by another node) or "program" (set by its own node).
 
     `saved` is what the module's file has for it; None: nothing. `problem` says why that is not used, if it does not
     fit.
