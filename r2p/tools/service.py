@@ -21,7 +21,7 @@ from r2p.tools.options import Format, Wait, time_option
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, TimedOut, UsageError
 from r2p.tools.topic.list import endpoints_of
-from r2p.tools.types import Types, is_service, load_service, load_type
+from r2p.tools.types import LEARNT, Types, is_service, load_service, load_type
 from r2p.tools.values import parse, to_plain
 
 app = session.group("List, inspect and call services.")
@@ -91,14 +91,16 @@ async def find(
     wait: Wait = None,
     format: Format = None,
 ) -> None:
-    """Find services by their type, or that of request or response.
+    """Find services by their type, also as `list` shows it, or by that of request or response.
 
     Firmware does not announce types: then only the sizes are compared, and the match is "size".
     """
     output = Output(format)
-    wanted, both = _wanted(type)
     pairs, types = await _discover(session, wait)
-    found = [(pair, match) for pair in pairs.values() if (match := _match(pair, wanted, both=both)) is not None]
+    found = [(pair, "type") for pair in pairs.values() if _type_name(types, pair) == type]
+    if not found:
+        wanted, both = _wanted(type)
+        found = [(pair, match) for pair in pairs.values() if (match := _match(pair, wanted, both=both)) is not None]
     await output.table([_row(session, pair, types) | {"match": match} for pair, match in found], [*_COLUMNS, "match"])
     if not found:
         raise r2p.Error(f"no services of type {type} found on {session.network_name}")
@@ -245,10 +247,13 @@ async def _definition(session: Session, name: str, given: str | None) -> Definit
         close = difflib.get_close_matches(name, _pairs(session), n=1)
         question = f"; did you mean {close[0]}?" if close else ""
         raise TimedOut(f"there is no service {name} on {session.network_name}{question}")
-    bodies = []
+    bodies: list[type[r2p.Message] | None] = []
     for view, field in ((pair.requests, _REQUEST), (pair.responses, _RESPONSE)):
         learnt = await types.learn(session, view)
-        bodies.append(None if learnt is None else body_of(learnt, field))
+        body = None if learnt is None else body_of(learnt, field)
+        if learnt is not None and body is not None and body.__module__ == LEARNT:  # for errors: as its server has it
+            body.__name__ = r2p.layout(learnt).name.rpartition("/")[2][: -len(REQUESTS)].replace("_Re", ".Re")
+        bodies.append(body)
     if None in bodies:
         raise UsageError(f"the types of service {name} are unknown: give --type package.module:Class")
     return define(name, *bodies)

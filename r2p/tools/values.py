@@ -108,7 +108,8 @@ def pick(message: Message, path: str, form: Form = "whole") -> Any:
     shape, value = _at(Nested(layout(type(message))), message, _STEP.findall(path))
     if shape is None:
         names = ", ".join(_names(layout(type(message))))
-        raise KeyError(f"there is no field {path[:_EXCERPT]}; the fields are {names}")
+        each = ", one --field for each" if "," in path else ""
+        raise KeyError(f"there is no field {path[:_EXCERPT]}; the fields are {names}{each}")
     return None if value is None else _plain(shape, value, form)
 
 

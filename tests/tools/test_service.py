@@ -58,6 +58,10 @@ async def test_list_info_and_find(capsys: pytest.CaptureFixture[str]) -> None:
     async with robot(serve), tool() as session:
         await list_(session)
         assert printed(capsys) == [row | {"callers": []}], "the module gives the types"
+        await find(session, "tests/Add")
+        assert printed(capsys) == [row | {"callers": [], "match": "type"}]
+        with pytest.raises(UsageError, match=r"^Add\.Request has no field x: it has a, b"):
+            await call(session, "add", ["x=1"])
     async with robot(serve) as module, tool() as session:
         keep_types(module)
         await list_(session)

@@ -120,8 +120,12 @@ async def test_an_unknown_field_is_a_mistake() -> None:
         with pytest.raises(ExceptionGroup) as caught:
             await echo(session, ["poses"], field=["z"])
     assert caught.group_contains(
-        UsageError, match="there is no field z; the fields are timestamp.sec, timestamp.nsec, x, y, w"
+        UsageError, match="there is no field z; the fields are timestamp.sec, timestamp.nsec, x, y, w$"
     )
+    async with robot(poses), tool() as session:
+        with pytest.raises(ExceptionGroup) as caught:
+            await echo(session, ["poses"], field=["x,y"])
+    assert caught.group_contains(UsageError, match="there is no field x,y; .* x, y, w, one --field for each$")
 
 
 @pytest.mark.virtual_time
