@@ -35,7 +35,7 @@ def test_any_bytes_are_a_header_or_a_decode_error(data: bytes) -> None:
     assert services.encode(header, data[HEADER_SIZE:]) == data
 
 
-@pytest.mark.parametrize("data", [bytes(6) + b"\0\x02" + bytes(4), bytes(6) + b"\x05\x01" + bytes(4)])
+@pytest.mark.parametrize("data", [bytes(6) + b"\0\x02" + bytes(4), bytes(6) + b"\x06\x01" + bytes(4)])
 def test_another_version_or_kind_is_unknown(data: bytes) -> None:
     with pytest.raises(UnknownType):
         services.decode(data)
