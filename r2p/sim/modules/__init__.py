@@ -6,13 +6,13 @@
             ...
 
 `firmware` has `FirmwareModule`, a module with the firmware of 2014: bytes in and bytes out, with time as an argument.
-`loader` has its loader, for boot mode, and `flash` the memory for apps.
-`power` has `Powered`, which runs it in an event loop and connects it: by a `wire` inside the process, which works under
-virtual time, by TCP, or by a pseudo terminal in place of a serial port.
+`loader` has its loader, for boot mode, `flash` the memory for apps, and `installed` the apps there. `power` has
+`Powered`, which runs it in an event loop and connects it: by a `wire` inside the process, which works under virtual
+time, by TCP, or by a pseudo terminal in place of a serial port.
 
 `boards` and `sensors` have the hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...): `r2p.Module`s
-with nodes around a model of `r2p.sim.physics`, on any transport. `Plant` advances the models. `r2p.sim.robots`
-assembles modules to robots.
+with nodes around a model of `r2p.sim.physics`, on any transport, and with the same loader (`boot`). `Plant` advances the
+models. `r2p.sim.robots` assembles modules to robots.
 """
 
 from r2p.sim.modules.boards import (

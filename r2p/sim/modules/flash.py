@@ -31,10 +31,10 @@ BOARD = FlashTimes(erase=0.03, write=0.026)
 class MemoryMap(msgspec.Struct, frozen=True, kw_only=True):
     """Where a module keeps its apps; by default as in the recordings.
 
-    Addresses of parts of an app are multiples of `flash_align`, or `ram_align`; an app whose working area is smaller
-    than `least_stack` bytes halts the module. `word`: bytes that the loader writes at once. It takes the rest of the
-    first and the last word from the flash, so words of which the buffer of a page holds only a part lose that part: 2
-    on an STM32F103, 1 in the recordings.
+    Addresses of parts of an app are multiples of `flash_align`, or `ram_align`; an app whose stack is smaller than
+    `least_stack` bytes halts the module. The loader writes whole words of `word` bytes, 1 in the recordings and 2 on an
+    STM32F103. It fills them up from the flash and not from its buffer of a page, so where two pieces of one session
+    share a word, the part of the first is lost.
     """
 
     flash_start: int = 0x0800F400
