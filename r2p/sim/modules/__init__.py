@@ -11,7 +11,7 @@
 time, by TCP, or by a pseudo terminal in place of a serial port.
 
 `boards` and `sensors` have the hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...): `r2p.Module`s
-with nodes around a model of `r2p.sim.physics`, on any transport, and with the same loader (`boot`). `Plant` advances the
+with nodes around a model of `r2p.sim.physics`, on any transport, and the same loader (`boot`). `Plant` advances the
 models. `r2p.sim.robots` assembles modules to robots.
 """
 
