@@ -188,7 +188,13 @@ def _get_part(app: str, offset: int, length: int) -> Procedure[bytes]:
 
 
 def set_(app: str, offset: int, data: bytes) -> Procedure[None]:
-    """Set bytes of an app's config area, or its flags (FLAGS_WORD), PARAM_MAX bytes in each session."""
+    """Set bytes of an app's config area, or its flags (FLAGS_WORD), PARAM_MAX bytes in each session.
+
+    A board writes half words, and takes the other byte of one from its flash: no two chunks of a session may share one.
+    """
+    if offset % 2 and len(data) > CHUNK:
+        yield from _set_part(app, offset, data[:1])
+        offset, data = offset + 1, data[1:]
     for part in _parts(offset, len(data)):
         yield from _set_part(app, part.start, data[part.start - offset : part.stop - offset])
 

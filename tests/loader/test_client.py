@@ -11,7 +11,7 @@ import r2p
 from r2p.codecs.loader import LinkingAddresses, LinkingSetup
 from r2p.loader import LoaderClient, LoaderError, LoaderSilent
 from r2p.msg import Led
-from r2p.sim.modules import EmulatedLoader, LoaderFaults
+from r2p.sim.modules import EmulatedLoader, LoaderFaults, MemoryMap
 from tests.loader.rig import board, client
 from tests.loader.test_session import CONFIG, link
 
@@ -48,6 +48,14 @@ async def test_what_a_loader_does() -> None:
         await loader.remove_last()
         assert (await loader.list_apps()).apps == ()
         assert loader.dropped == {}
+
+
+async def test_parameters_at_an_odd_place_are_set_on_a_board_that_writes_half_words() -> None:
+    async with client(EmulatedLoader(MemoryMap(word=2))) as (_, loader):
+        await loader.enter()
+        await loader.load(BLINK, link)
+        await loader.set("blink", 1, bytes(range(100, 120)))
+        assert await loader.get("blink", 0, 22) == CONFIG[:1] + bytes(range(100, 120)) + CONFIG[21:22]
 
 
 async def test_a_restart_of_the_loader_frees_its_memory() -> None:
