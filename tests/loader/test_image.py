@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import r2p
 from r2p.codecs.loader import AppinfoSummary, LinkingAddresses
 from r2p.loader.checks import expected_addresses
 from r2p.loader.files import read_app
@@ -123,6 +125,13 @@ def test_files_that_are_refused(copy: Any, name: str, changes: dict[str, str], t
 def test_an_option_replaces_what_the_description_says(copy: Any) -> None:
     app = read_app(copy("blink.elf"), {"name": "other", "stack": 2048, "enabled": True})
     assert (app.name, app.stack, app.setup.flags) == ("other", 2048, 1)
+
+
+def test_without_the_package_for_elf_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "elftools.elf.elffile", None)
+    with pytest.raises(r2p.Error, match=r"ELF files need pyelftools: install r2p\[elf\]"):
+        read_app(APPS / "blink.elf")
+    assert read_app(APPS / "linked.hex").name == "blink"
 
 
 def test_a_firmware_of_another_module() -> None:
