@@ -192,7 +192,7 @@ async def _back(session: Session, loader: LoaderClient) -> None:
 
 
 async def _check_state(session: Session, loader: LoaderClient, *, reboot: bool) -> None:
-    """Raise TimedOut for an unknown module, and r2p.Error for one without a boot loader, or that is not there.
+    """Raise TimedOut for an unknown module, and r2p.Error for one that is not in its boot loader.
 
     With `reboot`, firmware may be silent until it is restarted.
     """
@@ -204,7 +204,7 @@ async def _check_state(session: Session, loader: LoaderClient, *, reboot: bool) 
         if reboot and session.may_have_firmware():
             return
         raise TimedOut(unknown_module(session, loader.name))
-    if view.instance is not None:
+    if not view.has_loader:
         raise r2p.Error(f"{loader.name} is an r2p module, not firmware: leave out --firmware")
     if view.state != "boot" and not reboot:
         raise r2p.Error(

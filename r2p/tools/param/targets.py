@@ -19,6 +19,10 @@ from r2p.tools.output import notify
 from r2p.tools.session import Session, TimedOut, UsageError, wait_until
 
 _FOUND_WITHIN = 8.0  # seconds in which a module has been announced, through gateways as well
+_ENDED = {
+    "boot": "in its boot loader, where its nodes do not run: reboot it, or give --firmware APP",
+    "stopped": "stopped: reboot it",
+}
 _LEVELS = 6  # kinds of references
 _AT_ONCE = 8  # modules that are asked at the same time
 _SHOWN = 8  # names in an error
@@ -56,7 +60,7 @@ async def find_modules(session: Session, target: str | None, wait: float | None 
         finally:
             settled.cancel()
     names = _prefix(session, target)
-    known = {view.name: view for view in session.module.network.modules() if view.link and view.state != "observer"}
+    known = _known(session)
     if names and all(known[name].instance is None for name in names):
         raise r2p.Error(
             f"{names[0]} is firmware: its parameters are bytes of its apps. With --firmware APP, r2p param list, get "
@@ -127,10 +131,14 @@ async def _ask(session: Session, modules: list[str], *, may_fail: bool) -> Infos
         return [info for found in await asyncio.gather(*map(ask, modules)) for info in found]
 
 
+def _known(session: Session) -> dict[str, r2p.ModuleView]:
+    """Return the modules on the network by name, without tools."""
+    return {view.name: view for view in session.module.network.modules() if view.link and view.state != "observer"}
+
+
 def _prefix(session: Session, target: str | None) -> list[str]:
     """Return the known modules whose name a reference begins with: the longest, as names may begin alike."""
-    names = {view.name for view in session.module.network.modules() if view.link}
-    found = [name for name in names if target is not None and f"{target}/".startswith(f"{name}/")]
+    found = [name for name in _known(session) if target is not None and f"{target}/".startswith(f"{name}/")]
     return [max(found, key=len)] if found else []
 
 
@@ -153,7 +161,9 @@ def _unknown(session: Session, target: str, modules: list[str], infos: Infos) ->
         known = [*modules, *(info.node for info in infos), *nodes]
         return TimedOut(f"there is no {where}{similar(target, known, 'there are')}")
     if not infos:
-        return r2p.Error(f"no node of {', '.join(modules)} has parameters")
+        states = {name: view.state for name, view in _known(session).items() if name in modules}
+        ended = "".join(f"; {name} is {_ENDED[state]}" for name, state in states.items() if state in _ENDED)
+        return r2p.Error(f"no node of {', '.join(modules)} has parameters{ended}")
     node, name = _divided(target, nodes)
     if name is not None:
         own = [info.name for info in infos if f"{info.module}/{info.node}" == node]

@@ -20,7 +20,7 @@ FIELDS = [
 """The keys of a record for programs, in their order."""
 
 
-_WIDE = 32  # characters of a cell of that table; `info` shows all
+_WIDE = 40  # characters of a cell of that table; `info` shows all
 
 
 def record(info: r2p.ParameterInfo) -> dict[str, Any]:

@@ -192,7 +192,7 @@ async def test_other_modules() -> None:
         await asyncio.Event().wait()
 
     async with robot(idle), tool() as session:
-        with pytest.raises(r2p.Error, match="BOT is an r2p module"):
+        with pytest.raises(r2p.Error, match="BOT is an r2p module, not firmware: leave out --firmware"):
             await list_(session, "BOT", firmware="PID")
         with pytest.raises(TimedOut, match=r"there is no module BOTT on memory:lab; .* did you mean BOT\?"):
             await list_(session, "BOTT", firmware="PID")

@@ -70,6 +70,13 @@ async def test_a_module_that_does_not_answer() -> None:
             await list_(session, "BOT")
 
 
+async def test_a_module_that_is_stopped() -> None:
+    async with robot(drive) as module, tool() as session:
+        await module.stop()
+        with pytest.raises(r2p.Error, match="no node of BOT has parameters; BOT is stopped: reboot it"):
+            await list_(session, "BOT")
+
+
 async def test_a_module_that_falls_silent_while_it_is_set() -> None:
     def cut(_: float) -> None:
         network("lab").loss = 1.0
