@@ -143,7 +143,8 @@ class Board(r2p.Module):
     async def stop(self) -> None:
         """End nodes and apps, as `r2p.Module` does. In boot mode, the board then obeys no command any more."""
         if self.boot.in_boot_mode and not self.boot.fault:
-            self.boot.halt(self._new_node(NODE), "STOP in boot mode: its management hangs until its power is cut")
+            with contextlib.closing(self._new_node(NODE)) as node:
+                self.boot.halt(node, "STOP in boot mode: its management hangs until its power is cut")
         if not self.boot.fault:
             await self.boot.end()
             await super().stop()

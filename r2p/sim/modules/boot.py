@@ -46,15 +46,13 @@ class BoardBoot:
         """What the board did with its apps, the newest last."""
         self.fault = ""
         """Why the board has failed; only its power switch helps."""
+        self.in_boot_mode = False
+        """True while the loader runs."""
         self._tasks: list[asyncio.Task[None]] = []
-
-    @property
-    def in_boot_mode(self) -> bool:
-        """Return whether the loader runs."""
-        return any(task.get_name() == NODE for task in self._tasks)
 
     def start_loader(self, make_node: NodeMaker) -> None:
         """Start the loader."""
+        self.in_boot_mode = True
         self._run(make_node(NODE), self._serve)
 
     def start_apps(self, make_node: NodeMaker) -> None:
@@ -73,6 +71,7 @@ class BoardBoot:
 
     async def end(self) -> None:
         """End the loader or the apps."""
+        self.in_boot_mode = False
         tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.cancel()
