@@ -8,7 +8,7 @@ import typer
 
 import r2p
 from r2p.codecs.services import is_of_service
-from r2p.names import chosen_alias, topic_name
+from r2p.names import BUS_LOAD, BUS_SLOTS, chosen_alias, topic_name
 from r2p.tools.completion import complete_type
 from r2p.tools.options import CLASS_NAMES, Format, Wait
 from r2p.tools.output import Output, notify
@@ -103,6 +103,8 @@ async def find(
 
 
 def _unknown_text(session: Session, name: str, views: Mapping[str, r2p.TopicView], collisions: dict[str, str]) -> str:
+    if name in (BUS_LOAD, BUS_SLOTS):
+        return f"{name} is published only while it has a subscriber, by a module on a CAN bus: r2p topic echo {name}"
     question = suggest_topics(session, name, lambda view: True)
     known = question or f"; known topics: {', '.join(views) or 'none'}"
     reason = next((f"; {text}" for text in collisions.values()), known)

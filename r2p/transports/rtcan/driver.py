@@ -82,15 +82,15 @@ class EngineDriver:
 
     def on_frame(self, frame: Frame, stamp: int) -> None:
         try:
+            self.carry_out(self.engine.receive(self.now(), frame, stamp))
             if self._monitor is not None:
                 self._monitor.frame(frame, stamp - self.port.receive_latency)
-            self.carry_out(self.engine.receive(self.now(), frame, stamp))
         except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
             self._failed(error)
 
     def on_confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         try:
-            if self._monitor is not None:
+            if self._monitor is not None:  # first: the engine may put the next frame into this mailbox
                 self._count_own(self._monitor, mailbox, outcome, at)
             self.carry_out(self.engine.confirm(self.now(), mailbox, outcome, at))
         except Exception as error:  # noqa: BLE001 - counted and logged; the next confirmation follows

@@ -221,6 +221,8 @@ async def test_info_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: 
 @pytest.mark.virtual_time
 async def test_info_of_a_topic_that_nobody_knows() -> None:
     async with robot(blink), tool() as session:
+        with pytest.raises(r2p.Error, match="bus_load is published only while it has a subscriber"):
+            await info(session, "bus_load")
         with pytest.raises(r2p.Error, match="power has no publisher and no subscriber; known topics: leds, log, speed"):
             await info(session, "power")
         with pytest.raises(r2p.Error, match=r"led has no publisher and no subscriber; did you mean leds\?"):
