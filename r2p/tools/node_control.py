@@ -95,7 +95,10 @@ async def stop(session: Session, module: ModuleName, node: NodeName) -> None:
 
 
 async def restart(session: Session, module: ModuleName, node: NodeName) -> None:
-    """End one node and start its function again, with the code that was loaded for it."""
+    """End one node and start its function again.
+
+    It runs the code that was loaded for it: to run a changed file, swap it.
+    """
     nodes = await _find(session, module)
     with session.waiting(f"the end of {node}"):
         await _answered(nodes.restart(node))
@@ -122,9 +125,9 @@ async def swap(
     ] = False,
     format: Format = None,
 ) -> None:
-    """Let a new node take the place of another one, without a gap in what it publishes.
+    """Let a new node take the place of another one.
 
-    The file is loaded anew, so a changed one takes effect. The new node has the name of the old one unless NAME is
+    What they publish goes on without a gap. The file is loaded anew, so a changed one takes effect. The new node has the name of the old one unless NAME is
     given. If it crashes or is not ready in time, the old one goes on. The pause of each topic is printed: of a periodic
     one, from the last message of the old node to the first one of the new node.
     """
