@@ -127,9 +127,9 @@ async def swap(
 ) -> None:
     """Let a new node take the place of another one.
 
-    What they publish goes on without a gap. The file is loaded anew, so a changed one takes effect. The new node has the name of the old one unless NAME is
-    given. If it crashes or is not ready in time, the old one goes on. The pause of each topic is printed: of a periodic
-    one, from the last message of the old node to the first one of the new node.
+    What they publish goes on without a gap. The file is loaded anew, so a changed one takes effect. The new node has
+    the name of the old one unless NAME is given. If it crashes or is not ready in time, the old one goes on. The pause
+    of each topic is printed: of a periodic one, from the last message of the old node to the first one of the new node.
     """
     output = Output(format)
     code = _Code(target, send=send)
