@@ -213,6 +213,20 @@ async def paced(node: r2p.Node, period: r2p.Parameter[float]) -> AsyncIterator[r
                 break
 
 
+def quantity(
+    node: r2p.Node,
+    name: str,
+    default: float,
+    limits: tuple[float, float],
+    unit: str,
+    doc: str,
+    on_change: Callable[[float], object] | None = None,
+) -> r2p.Parameter[float]:
+    """Declare a parameter with a unit. A default beyond the limits, which the maker of a board chose, moves them."""
+    low, high = min(limits[0], default), max(limits[1], default)
+    return node.parameter(name, default, min=low, max=high, unit=unit, doc=doc, on_change=on_change)
+
+
 class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
     """The configuration of the motor module; times are what its parameters are at first."""
 
@@ -240,8 +254,7 @@ def tune(node: r2p.Node, drive: Drive) -> None:
     units = ("V/(rad/s)", "V/rad", "V/(rad/s^2)") if drive.mode == "speed" else ("V/rad", "V/(rad s)", "V/(rad/s)")
 
     def gain(name: str, default: float, most: float, unit: str, doc: str) -> r2p.Parameter[float]:
-        shown = float(f"{default * ticks:.6g}")
-        return node.parameter(name, shown, min=0.0, max=most, unit=unit, doc=doc, on_change=control)
+        return quantity(node, name, float(f"{default * ticks:.6g}"), (0.0, most), unit, doc, control)
 
     def control(_value: float) -> None:
         drive.pid.gains = Gains(kp.value / ticks, ki.value / ticks, kd.value / ticks, limit.value)
@@ -252,18 +265,10 @@ def tune(node: r2p.Node, drive: Drive) -> None:
     kp = gain("kp", gains.kp, 100.0, units[0], "Proportional gain of the control of the wheel")
     ki = gain("ki", gains.ki, 10_000.0, units[1], "Its integral gain; with 0 the wheel stays behind")
     kd = gain("kd", gains.kd, 10.0, units[2], "Its derivative gain, of what is measured")
-    limit = node.parameter(
-        "voltage_limit", gains.limit, min=0.0, max=36.0, unit="V", doc="Highest voltage at the motor", on_change=control
-    )
-    current = node.parameter(
-        "current_limit",
-        drive.motor.spec.current_limit,
-        min=0.0,
-        max=20.0,
-        unit="A",
-        doc="The bridge chops a higher current, which limits the torque",
-        on_change=chop,
-    )
+    limit = quantity(node, "voltage_limit", gains.limit, (0.0, 36.0), "V", "Highest voltage at the motor", control)
+    most = drive.motor.spec.current_limit
+    doc = "The bridge chops a higher current, which limits the torque"
+    current = quantity(node, "current_limit", most, (0.0, 20.0), "A", doc, chop)
     control(kp.value)
     chop(current.value)
 
@@ -285,26 +290,10 @@ async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
         )
     )
     measure = reopens(lambda period: node.advertise(config.encoder, Encoder, r2p.Periodic(period, moved)))
-    timeout = node.parameter(
-        "timeout",
-        config.timeout,
-        min=0.02,
-        max=10.0,
-        unit="s",
-        doc=f"The motor stops when no {config.setpoint} has arrived for so long",
-        on_change=listen,
-    )
-    period = node.parameter(
-        "encoder_period",
-        config.period,
-        min=0.005,
-        max=0.1,
-        unit="s",
-        doc=f"Period of {config.encoder}",
-        on_change=measure,
-    )
-    listen(timeout.value)
-    measure(period.value)
+    doc = "The motor stops when no setpoint has arrived for so long"
+    listen(quantity(node, "timeout", config.timeout, (0.02, 10.0), "s", doc, listen).value)
+    doc = "Period of the encoder's messages"
+    measure(quantity(node, "encoder_period", config.period, (0.005, 0.1), "s", doc, measure).value)
     try:
         while True:
             await node.spin()
@@ -314,9 +303,7 @@ async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
 
 async def monitor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
     """Publish the motor's current."""
-    period = node.parameter(
-        "period", config.current_period, min=0.01, max=10.0, unit="s", doc=f"Period of {config.current}"
-    )
+    period = quantity(node, "period", config.current_period, (0.01, 10.0), "s", "Period of the measurements")
     current = node.advertise(config.current, Float32)
     async for _ in paced(node, period):
         await current.publish(Float32(data=drive.motor.current))
@@ -422,7 +409,7 @@ def measured(battery: LeadBattery) -> Battery:
 
 async def power(node: r2p.Node, battery: LeadBattery, topic: str, period: float) -> None:
     """Publish the measurements."""
-    each = node.parameter("period", period, min=0.01, max=10.0, unit="s", doc=f"Period of {topic}")
+    each = quantity(node, "period", period, (0.01, 10.0), "s", "Period of the measurements")
     measurements = node.advertise(topic, Battery)
     async for _ in paced(node, each):
         await measurements.publish(measured(battery))
@@ -455,8 +442,8 @@ def _thresholds(node: r2p.Node) -> tuple[dict[int, Threshold], dict[int, Thresho
         low.hysteresis = high.hysteresis = voltage_hysteresis.value
         most.hysteresis = current_hysteresis.value
 
-    def threshold(name: str, default: float, most: float, unit: str, doc: str) -> r2p.Parameter[float]:
-        return node.parameter(name, default, min=0.0, max=most, unit=unit, doc=doc, on_change=change)
+    def threshold(name: str, default: float, highest: float, unit: str, doc: str) -> r2p.Parameter[float]:
+        return quantity(node, name, default, (0.0, highest), unit, doc, change)
 
     def ordered(hysteresis: float, values: Mapping[str, Any]) -> str | None:
         below = values["low_voltage"] + hysteresis < values["high_voltage"]

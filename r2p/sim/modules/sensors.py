@@ -13,7 +13,7 @@ import msgspec
 
 import r2p
 from r2p.msg import IMU, IMURaw9, Pressure, Proximity, Tilt
-from r2p.sim.modules.boards import Board, ParameterOptions, Via, paced, reopens
+from r2p.sim.modules.boards import Board, ParameterOptions, Via, paced, quantity, reopens
 from r2p.sim.physics.inertial import (
     ACCELEROMETER,
     BAROMETER_NOISE,
@@ -63,7 +63,7 @@ class RangeArray:
 async def proximity(node: r2p.Node, sensors: RangeArray, topic: str, period: float) -> None:
     """Publish the distances: event-triggered, because an obstacle needs an immediate reaction."""
     calibrate(node, sensors)
-    each = node.parameter("period", period, min=0.04, max=0.25, unit="s", doc=f"Period of {topic}")
+    each = quantity(node, "period", period, (0.04, 0.25), "s", "Period of the measurements")
     ranges = node.advertise(topic, Proximity, r2p.Sporadic(deadline=_REACTION))
     async for _ in paced(node, each):
         await ranges.publish(sensors.read())
@@ -95,15 +95,8 @@ def calibrate(node: r2p.Node, sensors: RangeArray) -> None:
         doc="For each sensor: see scale",
         on_change=change,
     )
-    longest = node.parameter(
-        "longest",
-        curve.longest,
-        min=1.0,
-        max=10_000.0,
-        unit="mm",
-        doc="Longest distance that the sensors measure: beyond it there is nothing",
-        on_change=change,
-    )
+    doc = "Longest distance that the sensors measure: beyond it there is nothing"
+    longest = quantity(node, "longest", curve.longest, (1.0, 10_000.0), "mm", doc, change)
     change(None)
 
 
@@ -189,8 +182,7 @@ async def readings(
 ) -> None:
     """Publish readings, time-triggered."""
     measure = reopens(lambda seconds: node.advertise(topic, type, r2p.Periodic(seconds, fill)))
-    each = node.parameter("period", period, min=0.0025, max=10.0, unit="s", doc=f"Period of {topic}", on_change=measure)
-    measure(each.value)
+    measure(quantity(node, "period", period, (0.0025, 10.0), "s", "Period of the readings", measure).value)
     await asyncio.Event().wait()
 
 
@@ -208,24 +200,10 @@ async def sensors(node: r2p.Node, unit: InertialUnit) -> None:
     acc = node.parameter("acc_range", AccelerometerRange["2g"], doc="Range of the accelerometer", on_change=rescale)
     gyro = node.parameter("gyro_range", GyroscopeRange["250dps"], doc="Range of the gyroscope", on_change=rescale)
     mag = node.parameter("mag_range", MagnetometerRange["1.3gauss"], doc="Range of the magnetometer", on_change=rescale)
-    gain = node.parameter(
-        "filter_gain",
-        FILTER_GAIN,
-        min=0.0,
-        max=100.0,
-        unit="1/s",
-        doc="How fast gravity and magnetic field correct the attitude",
-        on_change=refilter,
-    )
-    bias_gain = node.parameter(
-        "filter_bias_gain",
-        FILTER_BIAS_GAIN,
-        min=0.0,
-        max=100.0,
-        unit="1/s^2",
-        doc="How fast they correct the bias of the gyroscope",
-        on_change=refilter,
-    )
+    doc = "How fast gravity and magnetic field correct the attitude"
+    gain = quantity(node, "filter_gain", FILTER_GAIN, (0.0, 100.0), "1/s", doc, refilter)
+    doc = "How fast they correct the bias of the gyroscope"
+    bias_gain = quantity(node, "filter_bias_gain", FILTER_BIAS_GAIN, (0.0, 100.0), "1/s^2", doc, refilter)
     rescale(None)
     refilter(gain.value)
     await asyncio.Event().wait()

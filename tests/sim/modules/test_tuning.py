@@ -12,9 +12,9 @@ import pytest
 
 import r2p
 from r2p.msg import IMU, Encoder, Float32, IMURaw9, PowerEvent, Proximity
-from r2p.sim.modules.boards import Plant, PowerModule
+from r2p.sim.modules.boards import MotorConfig, Plant, PowerModule
 from r2p.sim.modules.sensors import ImuModule, InertialUnit, Motion, ProximityModule, RangeArray
-from r2p.sim.physics.motor import Gains, LeadBattery
+from r2p.sim.physics.motor import Gains, LeadBattery, MotorSpec
 from r2p.sim.physics.world import RangeSpec
 from tests.sim.modules.test_boards import SMOOTH, Bench, command
 
@@ -68,6 +68,19 @@ async def test_a_controller_of_positions_has_other_units(r2p_network: Network) -
         await asyncio.sleep(STARTED)
         units = {each.name: each.unit for each in module.parameters.infos("motor")}
     assert (units["kp"], units["ki"], units["kd"]) == ("V/rad", "V/(rad s)", "V/(rad/s)")
+
+
+async def test_what_the_maker_of_a_board_chose_is_within_its_limits(r2p_network: Network) -> None:
+    """However slow it is, and however long the names of its topics are."""
+    config = MotorConfig(period=0.5, timeout=60.0, current_period=20.0, encoder="e" * 120, setpoint="s" * 120)
+    async with Bench(MotorSpec(current_limit=25.0), Gains(1.0, limit=48.0)).module(r2p_network, config) as module:
+        await asyncio.sleep(STARTED)
+        values = {each.name: (each.value, each.maximum) for each in module.parameters.infos("motor")}
+    assert values["kp"] == pytest.approx((TICKS, TICKS), rel=1e-5)
+    assert values["voltage_limit"] == (48.0, 48.0)
+    assert values["current_limit"] == (25.0, 25.0)
+    assert values["timeout"] == (60.0, 60.0)
+    assert values["encoder_period"] == (0.5, 0.5)
 
 
 async def test_new_periods_and_time_outs_count_at_once(r2p_network: Network) -> None:
