@@ -1,7 +1,7 @@
 """The boot loader of firmware modules: list, load, remove and configure the apps in their flash (PROTOCOL.md 5).
 
 `client` has `LoaderClient`, which does that for programs. It runs the generators of `procedures` in a `session`, the
-state machine of the PC's side without I/O. `deploy` loads apps as a whole: `checks` before, what is read back behind.
+state machine of the PC's side without I/O. `deploy` loads apps as a whole: `checks` before, reading back at the end.
 
 What is loaded is an `image`, which `files` reads from HEX and ELF. Of an ELF file, `elf` takes what is needed,
 `linking` gives it addresses, and `relocations` has what changes in the code for these.

@@ -171,10 +171,15 @@ class LoaderClient:
         text = f"{self.name} did not confirm {order.name} in {ORDER_TIMEOUT:g} s"
         view = self.view()
         if view is None:
-            return f"{text}, and there was no sign of it: is its name right, its power on, and its link up?"
+            return f"{text}, and there was no sign of it: is its power on, and its link up? {self._found()}"
         text += f": it is {view.state}, last seen {view.age:.1f} s ago"
         by_ip = view.link.partition(":")[0] in {"tcp", "tcp-listen", "zenoh"}
         return f"{text}; if a gateway is in between, it must have --allow-control" if by_ip else text
+
+    def _found(self) -> str:
+        modules = self._module.network.modules()
+        names = sorted({each.name for each in modules if each.link and each.state != "observer"})
+        return f"Modules found: {', '.join(names) or 'none'}"
 
     async def _restart(self) -> None:
         """Restart the loader. It shows nothing but an ALIVE, so the order is sent several times."""

@@ -1,8 +1,8 @@
-"""Loading and removing apps as a whole: checked before, begun again after a fault, read back behind.
+"""Load and remove apps as a whole: check before, begin again after a fault, read back at the end.
 
 All apps are loaded in one boot of the loader, which is restarted before: it hands out RAM from its end at each start,
 and an aborted load keeps its RAM until then. So after a fault all of them are begun again. What such a fault has left
-is found out first, by a listing: of a message whose answer was lost, nobody else knows whether it was obeyed.
+is found out first, by a listing: only that shows whether a message whose answer was lost has been obeyed.
 """
 
 from collections.abc import Callable, Sequence
@@ -101,7 +101,10 @@ class Deployment:
             if app.name in names:
                 self._kept[app.name] = await self._state_of(app)
         self._erased = bool(listing.apps)
-        await remove_all(client)
+        try:
+            await remove_all(client)
+        except LoaderError as error:
+            raise self._failure(error) from error
         return await self._load_all(empty)
 
     async def _state_of(self, app: InstalledApp) -> _KeptState:
@@ -207,7 +210,8 @@ class Deployment:
         if self._erased:
             lost = {name: state.config.hex() for name, state in self._kept.items() if name in rest and state.config}
             text += "; its apps were removed" + "".join(f", {name} with config {data}" for name, data in lost.items())
-        text += f". Check its link, look at r2p app list {module}, and load again what is missing"
+        check = "Check its link, look" if isinstance(error, LoaderFault) else "Look"
+        text += f". {check} at r2p app list {module}, and load again what is missing"
         return LoaderSilent(text) if isinstance(error, LoaderSilent) else LoaderError(text)
 
 

@@ -7,6 +7,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 
@@ -39,6 +40,10 @@ _ERASED = b"\xff"
 _PAGE = 1 << 16  # bytes that records reach from one base
 
 
+U32 = Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]
+"""An address or a length."""
+
+
 class AppFileError(LoaderError, ValueError):
     """A file that is not an app, or lacks something: wrong whatever the module is."""
 
@@ -56,15 +61,15 @@ class AppDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """
 
     name: str | None = None
-    stack: int | None = None
+    stack: U32 | None = None
     enabled: bool = False
     module: str | None = None
-    main: int | str | None = None
-    config: tuple[int, int] | str | None = None
-    bss: tuple[int, int] = (0, 0)
-    data: tuple[int, int] = (0, 0)
-    constructors: tuple[int, int] = (0, 0)
-    destructors: tuple[int, int] = (0, 0)
+    main: U32 | str | None = None
+    config: tuple[U32, U32] | str | None = None
+    bss: tuple[U32, U32] = (0, 0)
+    data: tuple[U32, U32] = (0, 0)
+    constructors: tuple[U32, U32] = (0, 0)
+    destructors: tuple[U32, U32] = (0, 0)
     symbols: str | None = None
 
 

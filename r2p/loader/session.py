@@ -46,7 +46,7 @@ class LoaderError(Error):
 
 
 class LoaderFault(LoaderError):
-    """A session that ended before its time, through no fault of what was asked: it may be begun again."""
+    """A session that went wrong although what was asked may be possible: it may be begun again."""
 
 
 class LoaderRefused(LoaderFault):

@@ -19,7 +19,7 @@ CONFIG = bytes(range(1, 9))
 
 
 class SmallApp(AppImage):
-    """An app that is at home anywhere, with 8 bytes of config."""
+    """An app without relocations, with 8 bytes of config."""
 
     def __init__(self, name: str, *, config: bytes = CONFIG, bss: int = 8, stack: int = 1024) -> None:
         self.config = config

@@ -106,6 +106,7 @@ def copy(tmp_path: Path) -> Any:
         ("linked.hex", {"data": "data = [0x20004FB0, 4000]"}, "of its 372 bytes, 4000 are to be those of .data"),
         ("linked.hex", {"name": 'name = "ninechars"'}, "'ninechars' can't be the name of an app"),
         ("linked.hex", {"bss": "bas = 1"}, "unknown field `bas`; an app's description has name, stack"),
+        ("linked.hex", {"bss": "bss = [0, -8]"}, r"linked\.toml: Expected `int` >= 0 - at `\$\.bss"),
         ("linked.hex", {"bss": "bss ="}, "linked.toml: Invalid value"),
         ("blink.elf", {"symbols": ""}, "uses r2p_near, r2p_publish, r2p_sleep, state_of_firmware, ticks, which are in"),
         ("blink.elf", {"symbols": 'symbols = "blink.elf"'}, "which blink.elf does not have"),
