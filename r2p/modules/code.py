@@ -5,6 +5,7 @@ import from there, have changed; other modules of the program stay as they are. 
 before, and what runs goes on with the code that it has.
 """
 
+import ast
 import asyncio
 import contextlib
 import importlib
@@ -29,6 +30,8 @@ CODE_MAX = 256 << 10
 _TIMEOUT = 30.0  # seconds that the code of a file may run while it is loaded
 _PREFIX = "_r2p_"  # of the names of modules whose own name has another one already
 _SENT = f"{_PREFIX}sent_"  # ... and of those that were sent
+
+_INSTALLED = frozenset({"site-packages", "dist-packages"})
 
 _Signature = tuple[int, int]
 
@@ -119,12 +122,13 @@ class CodeLoader:
             sys.path.insert(0, str(directory))
 
     def _forget_changed(self) -> None:
-        """Forget the modules of the directory whose files have changed, and those that have anything of them."""
+        """Forget the modules of the directory whose files have changed, and those that import them."""
         own = dict(self._own_modules())
         changed = {name for name, path in own.items() if self._known.get(name) != _signature(path)}
-        while more := {name for name in own.keys() - changed if _uses(sys.modules[name], changed)}:
+        imports = {name: _imported(path, _package(name)) for name, path in own.items()} if changed else {}
+        while more := {name for name in own.keys() - changed if imports and imports[name] & changed}:
             changed |= more
-        for name in changed & own.keys():
+        for name in changed:
             cached = getattr(sys.modules.pop(name).__spec__, "cached", None)
             if cached:  # Python compares times in seconds: a second change in one would not be seen
                 with contextlib.suppress(OSError):
@@ -142,17 +146,39 @@ class CodeLoader:
         """Return the names of all loaded modules whose files are in the directory, with these."""
         for name, module in list(sys.modules.items()):
             file = getattr(module, "__file__", None)
-            if name == "__main__" or not isinstance(file, str):
+            if name == "__main__" or not isinstance(file, str) or _is_installed(file):
                 continue
             if Path(file).is_relative_to(self.directory) or name.startswith(_SENT):
                 yield name, Path(file)
 
 
-def _uses(module: types.ModuleType, names: set[str]) -> bool:
-    return any(
-        (value.__name__ if isinstance(value, types.ModuleType) else getattr(value, "__module__", None)) in names
-        for value in list(vars(module).values())
-    )
+def _is_installed(file: str) -> bool:
+    """Return whether a file is of r2p, of Python, or of an installed package: a virtual environment may be anywhere."""
+    return internal(file) or not _INSTALLED.isdisjoint(Path(file).parts) or file.startswith(sys.prefix + os.sep)
+
+
+def _package(name: str) -> str:
+    """Return the package to which the relative imports of a loaded module refer."""
+    return str(getattr(sys.modules[name], "__package__", None) or "")
+
+
+def _imported(path: Path, package: str) -> set[str]:
+    """Return the names of all modules that a file imports, those of their packages, and what may be a module in one."""
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (OSError, SyntaxError, ValueError):  # it is not the one that was loaded; it counts as changed
+        return set()
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names.update(each.name for each in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            with contextlib.suppress(ImportError):  # beyond the top of its package
+                base = importlib.util.resolve_name(base, package)
+            names.add(base)
+            names.update(f"{base}.{each.name}" for each in node.names)
+    return {name.rsplit(".", count)[0] for name in names for count in range(name.count(".") + 1)}
 
 
 def _signature(path: Path) -> _Signature | None:
@@ -165,6 +191,8 @@ def _signature(path: Path) -> _Signature | None:
 
 def _check_owner(path: Path) -> None:
     """Raise Error for a file that another user than this one and root has written, or everyone can write."""
+    if os.name != "posix":
+        return
     status = path.stat()
     if status.st_uid not in {0, os.geteuid()} or status.st_mode & stat.S_IWOTH:
         raise Error(f"{path} belongs to another user, or everyone can write it: chown it, and chmod o-w")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import logging
 import math
 import os
@@ -194,7 +195,13 @@ async def test_what_is_wrong_with_a_file_reaches_the_user(directory: Path) -> No
 @virtual_time
 async def test_changed_modules_are_loaded_again_and_unchanged_ones_shared(directory: Path) -> None:
     write(directory / "shared_by_nodes.py", "OPENED = []\n")
-    write(directory / "middle_of_nodes.py", "import helper_of_blink\n")
+    (directory / "package_of_nodes").mkdir()
+    write(directory / "package_of_nodes" / "__init__.py", "")
+    write(directory / "package_of_nodes" / "inner.py", "from helper_of_blink import VALUE\n")
+    write(directory / "middle_of_nodes.py", "from package_of_nodes.inner import VALUE\n")
+    installed = directory / "site-packages"
+    installed.mkdir()
+    write(installed / "installed_for_nodes.py", "OPENED = []\n")
     write(directory / "user.py", USER)
     async with AsyncExitStack() as stack:
         await stack.enter_async_context(host(directory))
@@ -204,8 +211,13 @@ async def test_changed_modules_are_loaded_again_and_unchanged_ones_shared(direct
             shared = sys.modules["shared_by_nodes"].OPENED
             assert shared[-1] == (name, 1 if number < 2 else 7)
             assert len(shared) == number + 1
-            if number == 1:
+            if number == 0:
+                sys.path.insert(0, str(installed))
+                kept = importlib.import_module("installed_for_nodes")
+            elif number == 1:
                 write(directory / "helper_of_blink.py", "VALUE = 7\n")
+                write(installed / "installed_for_nodes.py", "OPENED = [1]\n")
+        assert sys.modules["installed_for_nodes"] is kept
         assert sys.modules["user"].__file__ == str(directory / "user.py")
 
 
@@ -216,7 +228,7 @@ from shared_by_nodes import OPENED
 
 
 async def use(node):
-    OPENED.append((node.name, middle_of_nodes.helper_of_blink.VALUE))
+    OPENED.append((node.name, middle_of_nodes.VALUE))
     await asyncio.Event().wait()
 """
 
