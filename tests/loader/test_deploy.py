@@ -186,13 +186,7 @@ async def test_the_power_fails_at_each_message_and_loading_anew_works(number: in
     _, emulation = emulated()
     async with client(emulation) as (power, loader):
         await loader.enter()
-
-        async def cut() -> None:
-            while emulation.requests < number:  # noqa: ASYNC110 - the emulation has no event for it
-                await asyncio.sleep(0.005)
-            power.reset()
-
-        cutting = asyncio.create_task(cut())
+        cutting = asyncio.create_task(cut_at(power, number))
         with contextlib.suppress(LoaderError):
             await add(loader, "one")
         cutting.cancel()
@@ -203,6 +197,28 @@ async def test_the_power_fails_at_each_message_and_loading_anew_works(number: in
         await add(loader, "one")
         assert await names(loader) == ["one"]
         assert await loader.get("one", 0, 8) == CONFIG
+
+
+@pytest.mark.parametrize("number", range(1, 75, 5))
+async def test_the_power_fails_during_a_reload_and_loading_anew_works(number: int) -> None:
+    async with client(EmulatedLoader(times=BOARD)) as (power, loader):
+        await add(loader, "one", "two")
+        apps = [SmallApp("one"), SmallApp("two")]
+        cutting = asyncio.create_task(cut_at(power, power.module.loader.requests + number))
+        with contextlib.suppress(LoaderError):
+            await Deployment(loader, apps).replace()
+        cutting.cancel()
+        await loader.enter(restart=True)
+        await Deployment(loader, apps).replace()
+        assert await names(loader) == ["one", "two"]
+        assert await loader.get("two", 0, 8) == CONFIG
+
+
+async def cut_at(power: Powered, number: int) -> None:
+    """Cut the power for a moment when the loader gets this message."""
+    while power.module.loader.requests < number:  # noqa: ASYNC110 - the emulation has no event for it
+        await asyncio.sleep(0.005)
+    power.reset()
 
 
 async def test_the_cable_is_pulled_in_the_middle() -> None:
