@@ -4,6 +4,7 @@ The module has to be in its boot loader, and knows nothing of them but their byt
 the same bytes (`--as`) gives these their names and types. What is set is read back, as an ACK is no proof.
 """
 
+import asyncio
 import contextlib
 import json
 import re
@@ -137,8 +138,11 @@ async def set_(area: ConfigArea, output: Output, words: list[str]) -> None:
     if changed:
         first, last = changed[0], changed[-1] + 1
         await area.write(area.part.start + first, after[first:last])
-    written = f"{len(after[changed[0] : changed[-1] + 1])} bytes written and read back" if changed else "as it was"
-    notify(f"{area.app} on {area.module}: {written}")
+        notify(
+            f"{area.app} on {area.module}: {last - first} byte{'s' if last - first > 1 else ''} written and read back"
+        )
+    else:
+        notify(f"{area.app} on {area.module}: as it was")
     if area.cls is None:
         await _put_bytes(area, output, after)
         return
@@ -168,8 +172,13 @@ def _text(value: Any) -> str:
 async def _in_loader(session: Session, loader: LoaderClient, *, reboot: bool) -> AsyncIterator[None]:
     """Check that the module is in its boot loader, or take it there; and back at the end."""
     await _check_state(session, loader, reboot=reboot)
-    with session.waiting(f"the boot loader of {loader.name}"):
-        await loader.enter()
+    try:
+        with session.waiting(f"the boot loader of {loader.name}"):
+            await loader.enter()
+    except asyncio.CancelledError:  # by Ctrl-C, perhaps after BOOTLOAD
+        if reboot:
+            await _back(session, loader)
+        raise
     try:
         yield
     except BaseException:

@@ -187,6 +187,17 @@ async def test_a_loader_that_falls_silent_in_the_middle(config: str, capsys: pyt
     assert not capsys.readouterr().out
 
 
+@pytest.mark.parametrize("after", [0.02, 0.1, 0.2])
+async def test_ctrl_c_goes_back(after: float, config: str) -> None:
+    async with pid() as (power, session):
+        setting = asyncio.create_task(set_(session, "IMU1", ["kp=1"], firmware="PID", as_=config, reboot=True))
+        await asyncio.sleep(after)
+        setting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await setting
+        assert power.module.flags == 2
+
+
 async def test_other_modules() -> None:
     async def idle(node: r2p.Node) -> None:
         await asyncio.Event().wait()
