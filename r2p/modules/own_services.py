@@ -394,8 +394,14 @@ class OwnServices:
         return kept
 
     def _keep(self, call: OwnCall, data: bytes) -> _Content:
-        """Make a content of a handler's answer, and keep it for the requests of its other pages."""
+        """Make a content of a handler's answer, and keep it for the requests of its other pages.
+
+        While it is what the caller fetches already, it is the same edition: else two fetches would disturb each other.
+        """
         key = (call.header.instance, call.operation, call.body)
+        kept = self._contents.get(key)
+        if kept is not None and kept.data == data:
+            return kept
         self._edition = self._edition % (EDITIONS - 1) + 1
         content = _Content(self._edition, data)
         if content.pages > PAGES_MAX:

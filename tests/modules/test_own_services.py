@@ -209,6 +209,17 @@ async def test_a_content_that_changes_while_it_is_fetched_comes_from_one_edition
         assert 20 < made <= 40
 
 
+async def test_two_fetches_of_one_content_do_not_disturb_each_other() -> None:
+    async with two(MemoryNetwork(delay=0.001)) as (a, b):
+        services(a).serve(Operation.STATISTICS, lambda _argument: bytes(1000))
+
+        async def fetch(delay: float) -> bytes:
+            await asyncio.sleep(delay)
+            return await services(b).fetch(a.instance, Operation.STATISTICS)
+
+        assert await asyncio.gather(*(fetch(0.003 * number) for number in range(10))) == [bytes(1000)] * 10
+
+
 @pytest.mark.parametrize("seed", range(5))
 async def test_hostile_messages(seed: int) -> None:
     """Nothing of them raises, is kept without a limit, or is answered more often than the limit allows."""
