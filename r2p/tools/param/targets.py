@@ -33,11 +33,11 @@ Infos = list[r2p.ParameterInfo]
 async def find(session: Session, target: str | None, names: Iterable[str] = (), wait: float | None = None) -> Infos:
     """Return the parameters that a reference means (None: all of the network), and of those the ones of these names.
 
-    Raises TimedOut if there is no such module or it does not answer, and r2p.Error if it has no such parameter. Of all
+    Raises TimedOut if there is no such module or none answers, and r2p.Error if it has no such parameter. Of several
     modules, those that can't answer are only reported.
     """
     modules = await find_modules(session, target, wait)
-    infos = await _ask(session, modules, may_fail=target is None or len(modules) > 1)
+    infos = await _ask(session, modules)
     infos.sort(key=lambda info: (info.module, info.node))  # what a node declares stays in its order
     if target is None:
         return infos
@@ -113,22 +113,27 @@ def similar(wanted: str, known: Iterable[str], what: str) -> str:
     return f"; {what}: {', '.join(known[:_SHOWN]) or 'none'}{more}"
 
 
-async def _ask(session: Session, modules: list[str], *, may_fail: bool) -> Infos:
-    """Return what modules answer, in their order. Where one `may_fail`, that is only reported."""
-    limit = asyncio.Semaphore(_AT_ONCE)
+async def _ask(session: Session, modules: list[str]) -> Infos:
+    """Return what modules answer, in their order. Where one fails, that is only reported if another one answers."""
+    limit, errors = asyncio.Semaphore(_AT_ONCE), list[Exception]()
 
     async def ask(module: str) -> Infos:
         async with limit:
             try:
                 return await session.module.network.parameters(module)
-            except (r2p.Error, TimeoutError) as error:
-                if not may_fail:
-                    raise TimedOut(str(error)) if isinstance(error, TimeoutError) else error from None
-                notify(str(error))
-                return []
+            except TimeoutError as error:
+                errors.append(TimedOut(str(error)))
+            except r2p.Error as error:
+                errors.append(error)
+            return []
 
     with session.waiting(f"the parameters of {', '.join(modules)}"):
-        return [info for found in await asyncio.gather(*map(ask, modules)) for info in found]
+        infos = [info for found in await asyncio.gather(*map(ask, modules)) for info in found]
+    if errors and not infos:
+        raise errors.pop()
+    for error in errors:
+        notify(str(error))
+    return infos
 
 
 def _known(session: Session) -> dict[str, r2p.ModuleView]:

@@ -19,7 +19,6 @@ FIELDS = [
 ]
 """The keys of a record for programs, in their order."""
 
-
 _WIDE = 40  # characters of a cell of that table; `info` shows all
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from typing import TYPE_CHECKING
 
 import pytest
@@ -66,8 +67,19 @@ async def test_a_module_that_does_not_answer() -> None:
     async with robot(drive), tool() as session:
         await session.settle()
         network("lab").loss = 1.0
-        with pytest.raises(TimedOut, match="module BOT does not answer"):
-            await list_(session, "BOT")
+        for target in ("BOT", None):
+            with pytest.raises(TimedOut, match="module BOT does not answer"):
+                await list_(session, target)
+
+
+async def test_a_module_that_knows_no_parameters_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(drive) as module, robot(drive, name="ARM"), tool() as session:
+        await session.settle()
+        module._opened.own_services._handlers.clear()
+        await list_(session)
+    captured = capsys.readouterr()
+    assert "which knows no parameters: update it there" in captured.err
+    assert {json.loads(line)["module"] for line in captured.out.splitlines()} == {"ARM"}
 
 
 async def test_a_module_that_is_stopped() -> None:
