@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import importlib
 import importlib.util
+import inspect
 import linecache
 import os
 import stat
@@ -231,7 +232,7 @@ def _function(file: str, module: types.ModuleType, name: str) -> NodeFunction:
         names = ", ".join(
             each
             for each, value in vars(module).items()
-            if getattr(value, "__module__", None) == module.__name__ and asyncio.iscoroutinefunction(value)
+            if getattr(value, "__module__", None) == module.__name__ and inspect.iscoroutinefunction(value)
         )
         raise Error(f"{file} has no function {name}; {f'it has {names}' if names else 'it defines no node'}")
     with contextlib.suppress(InvalidName):  # the node may have another name

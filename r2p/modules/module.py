@@ -363,7 +363,8 @@ class Module:
         node's unless given.
 
         Raises Error, and the old node goes on, if the new one crashes or returns, or does not publish and serve what
-        the old one does in time; other errors are those of `start`. STOP, REBOOT and the end of the module end both.
+        the old one does in time, as `limits` say; other errors are those of `start`. STOP, REBOOT and the end of the
+        module end both nodes.
         """
         self._check_startable()
         names = None if remap is None else _checked_remap(remap)

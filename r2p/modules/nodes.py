@@ -123,6 +123,7 @@ class NodeTable:
 
         Raises as `Module.swap`. A cancellation of the caller ends the swap while the old node still goes on.
         """
+        limits.check()
         before = self._settled(old)
         if not before.running:
             raise Error(f"node {old} of module {self._module} does not run: start the new one instead")

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from r2p.clock import clock_of
+from r2p.clock import check_seconds, clock_of
 from r2p.errors import Error
 from r2p.log_lines import get_logger
 from r2p.modules.supervisor import Supervisor
@@ -77,6 +77,11 @@ class SwapLimits(msgspec.Struct, frozen=True):
     settle: float = SETTLE
     cleanup: float = CLEANUP
     partial: bool = False
+
+    def check(self) -> None:
+        """Raise MessageError unless both times are numbers of seconds."""
+        check_seconds("settle of a swap", self.settle, least=0.0)
+        check_seconds("cleanup of a swap", self.cleanup, least=0.0)
 
 
 class NodeSwap:

@@ -453,6 +453,8 @@ async def test_a_node_swaps_itself_and_two_swaps_do_not_meet() -> None:
                 await change
         with pytest.raises(r2p.Error, match="already has a node motor"):
             module.start(hold, name="motor")
+        with pytest.raises(r2p.MessageError, match="cleanup of a swap is in seconds"):
+            await module.swap("motor", hold, limits=r2p.SwapLimits(cleanup=-1.0))
         with pytest.raises(r2p.Error, match="module PC1 has no node wheel; its nodes: motor"):
             await module.swap("wheel", hold)
         await asyncio.sleep(2.0)
