@@ -94,7 +94,7 @@ def complete_awaited(ctx: typer.Context, incomplete: str) -> list[str]:
 
 def complete_entry(ctx: typer.Context, incomplete: str) -> list[str]:
     """Completions for an entry of the file of `r2p launch`."""
-    with _silence():
+    with silence():
         path = ctx.params.get("file") or find_config()
         return beginning(incomplete, read_config(path).launch if path else ())
     return []
@@ -105,7 +105,7 @@ def complete_type(incomplete: str) -> list[str]:
     classes = standard_types()
     if ":" in incomplete:
         return beginning(incomplete, [f"{STANDARD}:{cls.__name__}" for cls in classes])
-    with _silence():
+    with silence():
         classes += Types(settings()).named
     bare = [cls.__name__ for cls in standard_types()]
     return beginning(incomplete, bare + [type_name(cls) for cls in classes])
@@ -140,7 +140,7 @@ async def nodes(session: Session) -> list[str]:
 
 def on_network(ctx: typer.Context, source: Source) -> list[str]:
     """Return what there is on the network of the command line, R2P_VIA or r2p.toml; nothing if there is none."""
-    with _silence():
+    with silence():
         chosen = settings(list(ctx.params.get("via") or ()), tool=True)
         if not all(url.startswith(IN_ONE_PROGRAM) for url in chosen.via):
             return asyncio.run(find(chosen, source))
@@ -149,13 +149,13 @@ def on_network(ctx: typer.Context, source: Source) -> list[str]:
 
 def _stated(incomplete: str) -> list[str]:
     """Return the topics that r2p.toml names."""
-    with _silence():
+    with silence():
         return list(settings().types)
     return []
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Suppress all errors and log records: they would stand between the user's keys."""
     disabled = logging.root.manager.disable
     logging.disable()

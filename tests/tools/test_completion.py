@@ -55,6 +55,8 @@ def completions(line: str) -> list[str]:
         ("r2p topic echo robot/e", ["robot/encoder"]),
         ("r2p topic echo --via memory:lab l", []),
         ("r2p launch --ready dr", ["drive"]),
+        ("r2p param get IMU1 --firmware PID --as Encoder ", ["delta"]),
+        ("r2p param get IMU1 --firmware PID --as Nothing ", []),
     ],
 )
 def test_words_are_completed(line: str, found: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

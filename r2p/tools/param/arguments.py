@@ -7,9 +7,10 @@ from typing import Annotated
 import typer
 
 import r2p
-from r2p.tools.completion import beginning, modules, on_network
+from r2p.tools.completion import beginning, modules, on_network, silence
 from r2p.tools.param.targets import Infos, meant
-from r2p.tools.session import Session
+from r2p.tools.session import Session, settings
+from r2p.tools.types import Types
 
 _ANSWERS = 0.5  # seconds to wait for the answers of modules while a shell completes
 
@@ -36,8 +37,10 @@ def complete_module_with_parameters(ctx: typer.Context, incomplete: str) -> list
 
 
 def complete_name(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Completions for the name of a parameter, behind a reference."""
+    """Completions for the name of a parameter, behind a reference; with --as, of a field of that type."""
     target = ctx.params.get("target")
+    if ctx.params.get("as_"):
+        return beginning(incomplete, _fields(ctx.params["as_"]))
 
     async def names(session: Session) -> list[str]:
         infos = await _infos(session)
@@ -55,6 +58,13 @@ def complete_assignment(ctx: typer.Context, incomplete: str) -> list[str]:
         return [f"{name}={value}" for info in infos for value in _values_of(info)]
 
     return beginning(incomplete, on_network(ctx, values)) if "=" in incomplete else complete_name(ctx, incomplete)
+
+
+def _fields(text: str) -> list[str]:
+    """Return the names of the fields of a type that the user names."""
+    with silence():
+        return [field.wire_name for field in r2p.layout(Types(settings()).load(text)).fields]
+    return []
 
 
 def _values_of(info: r2p.ParameterInfo) -> tuple[str, ...]:
