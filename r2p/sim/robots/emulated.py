@@ -33,7 +33,7 @@ from r2p.sim.modules.boards import (
     PowerModule,
 )
 from r2p.sim.modules.sensors import ProximityModule, RangeArray
-from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor
+from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor, speed_gains
 from r2p.sim.physics.world import OmniBody, Triple, World
 from r2p.sim.robots import triskar2
 from r2p.transports.link import Transport
@@ -44,10 +44,8 @@ if TYPE_CHECKING:
 
 STEP = 0.002
 """Seconds of the physics, and of the control of the motors."""
-KP, KI = 1.9, 30.0
-"""Gains of the wheels' speed control, V/(rad/s) and V/rad. Apart from the coupling of the wheels, its natural frequency
-is 20 rad/s and its damping 0.8 (`speed_gains`).
-"""
+FREQUENCY, DAMPING = 20.0, 0.8
+"""Natural frequency (rad/s) and damping of the wheels' speed control, apart from the coupling of the wheels."""
 
 MOTORS = ("MOTOR1", "MOTOR2", "MOTOR3")
 PROXIMITY = {"PROX1": "prox_front", "PROX2": "prox_rear"}
@@ -70,8 +68,7 @@ class Hardware:
         self.world = world or World()
         self.motors = [Motor(triskar2.MOTOR) for _ in MOTORS]
         self.body = OmniBody(triskar2.BODY, self.motors, self.noise("body"))
-        ticks = triskar2.MOTOR.ticks_per_radian
-        gains = Gains(KP / ticks, KI / ticks, limit=triskar2.MOTOR.voltage)
+        gains = _rounded(speed_gains(triskar2.MOTOR, self.body.own, frequency=FREQUENCY, damping=DAMPING))
         self.drives = [Drive(motor, gains) for motor in self.motors]
         self.battery = LeadBattery(triskar2.BATTERY)
         self.plant = Plant([*self.drives, self.body, self], dt=STEP)
@@ -92,6 +89,13 @@ class Hardware:
         x = self.body.x + _SENSORS_AT * math.cos(at)
         y = self.body.y + _SENSORS_AT * math.sin(at)
         return 1000 * min(self.world.distance(x, y, at + math.radians(ray)) for ray in _BEAM)
+
+
+def _rounded(gains: Gains) -> Gains:
+    """Return gains with two digits per radian of the wheel, as they are typed: 1.9 V/(rad/s) and 30 V/rad."""
+    ticks = triskar2.MOTOR.ticks_per_radian
+    kp, ki = (float(f"{each * ticks:.2g}") / ticks for each in (gains.kp, gains.ki))
+    return Gains(kp, ki, limit=gains.limit)
 
 
 class Triskar2:
