@@ -73,7 +73,7 @@ class CodeLoader:
         except (OSError, ValueError, RuntimeError):  # a loop of links, a null byte
             raise Error(f"{file!r} is not a path") from None
         if not path.is_relative_to(self.directory):
-            raise Error(f"{file} is not in {self.directory}, and no other code may be loaded (--allow-load DIR)")
+            raise Error(f"{file} is not in {self.directory}, and no other code may be loaded (--load-dir)")
         if not found:
             raise Error(f"there is no file {file} in {self.directory}, on the computer of the module")
         _check_owner(path)

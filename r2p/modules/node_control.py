@@ -172,8 +172,8 @@ class NodeControl:
     def _get_loader(self) -> CodeLoader:
         if self._loader is None:
             raise Error(
-                f"{self._module} lets no other module start, end or swap its nodes: start it with `r2p run "
-                "--allow-load DIR`, or Module(allow_load=DIR)"
+                f"{self._module} refuses to start, end and swap nodes for other modules: start it with `r2p run "
+                "--allow-load`, or Module(allow_load=True)"
             )
         return self._loader
 

@@ -22,7 +22,7 @@ Target = Annotated[
     str,
     typer.Argument(
         metavar="FILE:FUNCTION[=NAME]",
-        help="A file of the module's computer, relative to the directory of its --allow-load.",
+        help="A file of the module's computer, relative to its --load-dir.",
         show_default=False,
     ),
 ]

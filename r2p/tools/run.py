@@ -46,8 +46,11 @@ _Priority = Annotated[
     typer.Option(metavar="NODE=N", help="Nodes of higher priority get their messages first; default 0 (repeatable)."),
 ]
 _AllowLoad = Annotated[
+    bool, typer.Option("--allow-load", help="Let r2p node start, end and swap nodes here, with code in --load-dir.")
+]
+_LoadDir = Annotated[
     Path | None,
-    typer.Option("--allow-load", metavar="DIR", help="Let r2p node start, end and swap nodes here, with code in DIR."),
+    typer.Option(metavar="DIR", help="Where the code for --allow-load is; default: the working directory."),
 ]
 
 
@@ -75,7 +78,8 @@ async def command(
     params_file: ParamsFile = None,
     params: Params = None,
     param: Param = None,
-    allow_load: _AllowLoad = None,
+    allow_load: _AllowLoad = False,
+    load_dir: _LoadDir = None,
     via: Via = None,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended, or Ctrl-C.
@@ -83,8 +87,10 @@ async def command(
     A crash ends only that node; the command then exits with 1. With --allow-load it runs until Ctrl-C, also without
     functions: nodes may be started later.
     """
-    if not functions and allow_load is None:
-        raise UsageError("which function? r2p run blink.py:blink; with --allow-load DIR, nodes can be started later")
+    if not functions and not allow_load:
+        raise UsageError("which function? r2p run blink.py:blink; with --allow-load, nodes can be started later")
+    if load_dir is not None and not allow_load:
+        raise UsageError("--load-dir says where the code for --allow-load is: give that, too")
     chosen = settings(via)
     check_urls(chosen.via, chosen.via_source)
     names = chosen.remap | _parse_remap(remap or ())
@@ -99,7 +105,7 @@ async def command(
         allow_control=allow_control,
         params_file=params_file or chosen.params_file,
         params=parameter_sources(name, chosen, params or (), param or ()),
-        allow_load=allow_load or False,
+        allow_load=load_dir or allow_load,
     ) as host:
         for program in programs:
             host.start(program.function, name=program.name, priority=priorities.get(program.name, 0), restart=restart)

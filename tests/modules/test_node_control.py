@@ -148,7 +148,7 @@ ERRORS = {
     "blink.py:wheel": "blink.py has no function wheel; it has blink, crash",
     "blink.py:NUMBER": "3 is not a coroutine function",
     "none.py:blink": "there is no file none.py in /",
-    "../blink.py:blink": "is not in /.*, and no other code may be loaded \\(--allow-load DIR\\)",
+    "../blink.py:blink": "is not in /.*, and no other code may be loaded \\(--load-dir\\)",
     "/etc/passwd:blink": "/etc/passwd is not in /",
     "link.py:blink": "link.py is not in /",
     "data.txt:blink": "data.txt is not a Python file: its name must end with .py",
@@ -245,7 +245,7 @@ async def test_a_module_without_allow_load_refuses_and_says_what_to_do(directory
             nodes.restart("blink"),
             nodes.swap("blink", "blink.py", "blink"),
         ):
-            with pytest.raises(r2p.Error, match=r"with `r2p run --allow-load DIR`, or Module\(allow_load=DIR\)"):
+            with pytest.raises(r2p.Error, match=r"with `r2p run --allow-load`, or Module\(allow_load=True\)"):
                 await change
         assert [each.running for each in (await nodes.fetch()).nodes] == [True]
     with pytest.raises(r2p.Error, match="allow_load: there is no directory"):

@@ -128,7 +128,9 @@ async def test_what_can_not_be(directory: Path) -> None:
             await node_control.stop(session, "ARM", "blink")
         with pytest.raises(r2p.Error, match="BOT: module BOT has no node blink; its nodes: none"):
             await node_control.stop(session, "BOT", "blink")
-        with pytest.raises(r2p.Error, match=r"PC1 lets no other module start, end or swap its nodes: start it with"):
+        with pytest.raises(
+            r2p.Error, match=r"PC1 refuses to start, end and swap nodes for other modules: start it with"
+        ):
             await node_control.stop(session, "PC1", "blink")
         await node_control.start(session, "BOT", "robot_nodes.py:blink")
         with pytest.raises(r2p.Error, match="BOT: the new node crashed: ValueError: no port; blink goes on"):
