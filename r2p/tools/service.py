@@ -91,7 +91,7 @@ async def find(
     wait: Wait = None,
     format: Format = None,
 ) -> None:
-    """Find services by their type, also as `list` shows it, or by that of request or response.
+    """Find services by their type, or by that of request or response.
 
     Firmware does not announce types: then only the sizes are compared, and the match is "size".
     """
