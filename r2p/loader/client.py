@@ -133,7 +133,8 @@ class LoaderClient:
         LoaderSilent if it does not get there.
         """
         self._module.query()
-        await self._until(lambda: self.view() is not None, _FIRST_STATE)  # firmware may announce itself later, or never
+        # Firmware may announce itself later, or never; and an r2p module says behind its name that it has a loader.
+        await self._until(lambda: (found := self.view()) is not None and found.has_loader, _FIRST_STATE)
         view = self.view()
         if view is not None and not view.has_loader:
             raise LoaderError(f"{self.name} is an r2p module, a program without a boot loader: apps are for firmware")

@@ -190,7 +190,7 @@ class _CommandSender:
         while True:
             if self._is_unknown():
                 raise r2p.Error(unknown_module(self._session, self.name))
-            self._check_has_loader()
+            await self._check_has_loader()
             if not self._flags:
                 self._session.module.query()  # again: a gateway may not have heard the first one
             self._session.module.command(self._command, self.name)
@@ -200,10 +200,18 @@ class _CommandSender:
         if self._denied:
             raise r2p.Error(self._denied)
 
-    def _check_has_loader(self) -> None:
-        """Raise r2p.Error if the command needs a boot loader, and the module has none."""
-        view = _find(self._session, self.name)
-        if self._command is r2p.Command.BOOTLOAD and view is not None and not view.has_loader:
+    async def _check_has_loader(self) -> None:
+        """Raise r2p.Error if the command needs a boot loader, and the module has none: it says so after its name."""
+        if self._command is not r2p.Command.BOOTLOAD:
+            return
+
+        def has_loader() -> bool:
+            view = _find(self._session, self.name)
+            return view is None or view.has_loader
+
+        if not has_loader():
+            self._session.module.query()
+        if not await wait_until(has_loader, _FIRST_STATE):
             raise r2p.Error(f"{self.name} is an r2p module, a program without a boot loader: it would refuse BOOTLOAD")
 
     def _is_over(self) -> bool:

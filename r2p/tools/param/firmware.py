@@ -40,6 +40,7 @@ Raw = Annotated[
 Reboot = Annotated[bool, typer.Option("--reboot", help="Restart the module into its boot loader, and back at the end.")]
 
 _ALIVE = 6.0  # seconds in which firmware sends ALIVE at least once
+_LOADER = 1.0  # seconds until a module has said behind its name that it has a boot loader
 _HEX = re.compile(r"[0-9a-fA-F]*")
 
 
@@ -208,6 +209,7 @@ async def _check_state(session: Session, loader: LoaderClient, *, reboot: bool) 
     session.module.query()
     with session.waiting(f"{loader.name} (firmware announces itself within 5 s)"):
         await wait_until(lambda: loader.view() is not None, _ALIVE)
+        await wait_until(lambda: (found := loader.view()) is None or found.has_loader, _LOADER)
     view = loader.view()
     if view is None:
         if reboot and session.may_have_firmware():
