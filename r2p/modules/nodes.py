@@ -51,6 +51,8 @@ class NodeTable:
         self._swaps: dict[NodeSwap, asyncio.Task[SwapResult | Error]] = {}
         self._leaving: list[Supervisor] = []
         """Nodes that were swapped, and still clean up."""
+        self._times_ended = 0
+        """Calls of `end_all`, after which no restart that waits may start its node."""
 
     @property
     def running(self) -> bool:
@@ -66,6 +68,7 @@ class NodeTable:
 
     async def end_all(self, reason: str) -> None:
         """Cancel all nodes, and wait until each has cleaned up."""
+        self._times_ended += 1
         for swap in self._swaps:
             swap.interrupt(reason)
         tasks: list[asyncio.Task[Any]] = [task for each in self._all() if (task := each.cancel()) is not None]
@@ -102,9 +105,10 @@ class NodeTable:
 
     async def restart(self, name: str) -> Node:
         """End a node if it runs, and start it anew. Raises Error as `stop`."""
-        supervisor = self._settled(name)
+        supervisor, times_ended = self._settled(name), self._times_ended
         await supervisor.stop()
-        if self.tasks is None or self.supervisors.get(name) is not supervisor or supervisor.running:
+        ended = self.tasks is None or self._times_ended != times_ended
+        if ended or self.supervisors.get(name) is not supervisor or supervisor.running:
             raise Error(f"node {name} of module {self._module} was replaced or ended while it was restarted")
         self.crashes.pop(name, None)
         self._start(supervisor)
