@@ -13,11 +13,12 @@ A text is `u8 size` and its bytes in UTF-8. A value is `u8 kind`, and behind it
 
 import enum
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import msgspec
 
-from r2p.errors import DecodeError, MessageError
+from r2p.errors import DecodeError, InvalidName, MessageError
+from r2p.names import node_name, parameter_name
 
 Plain = bool | int | float | str | tuple[int, ...] | tuple[float, ...]
 """A value outside of its node: a member of an enum is its name."""
@@ -135,6 +136,12 @@ class _ValueReader:
         except UnicodeDecodeError as error:
             raise DecodeError(f"a text that is not UTF-8: {error.reason}") from None
 
+    def name(self, check: Callable[[str], str]) -> str:
+        try:
+            return check(self.text())
+        except InvalidName as error:
+            raise DecodeError(str(error)) from None
+
     def value(self) -> Plain | None:
         number = self.byte()
         if not number:
@@ -185,7 +192,7 @@ def encode_list(listed: ParameterList) -> bytes:
 def decode_list(data: bytes) -> ParameterList:
     """Decode the answer to PARAMETERS or PARAMETER_CHANGES; what later versions add to a record is left out.
 
-    Raises DecodeError.
+    Raises DecodeError, also for names that no node or parameter can have: tools offer them to shells.
     """
     reader = _ValueReader(data)
     version, revision, whole = reader.unpack(_LIST)
@@ -222,7 +229,7 @@ def _encode_record(record: ParameterRecord) -> bytes:
 
 
 def _decode_record(reader: _ValueReader, flags: int, origin: int) -> ParameterRecord:
-    node, name, kind = reader.text(), reader.text(), reader.kind()
+    node, name, kind = reader.name(node_name), reader.name(parameter_name), reader.kind()
     default, value = reader.value(), reader.value()
     if default is None or value is None:
         raise DecodeError(f"{node}.{name} has no value")

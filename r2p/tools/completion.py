@@ -31,6 +31,7 @@ Source = Callable[[Session], Awaitable[Iterable[str]]]
 _LINK_UP = 1.0  # seconds to wait for a link
 _LISTEN = 0.9  # seconds to listen for announcements at most; r2p modules answer at once
 _LIMIT = 3.0  # seconds after which the process ends: a host name may take longer to look up, and can't be interrupted
+_UNSAFE = re.compile(r"[^\w./:?=,@+-]")  # in words of a network: shells replace, run or cut at it
 _BREAKS = re.compile(r"[:=@]+")  # a word of its own in bash, even between two parts of one
 
 
@@ -170,8 +171,8 @@ def silence() -> Iterator[None]:
 
 
 def beginning(incomplete: str, names: Iterable[str]) -> list[str]:
-    """Return the names that begin like this, each once."""
-    return list(dict.fromkeys(name for name in names if name.startswith(incomplete)))
+    """Return the names that begin like this, each once; none that a shell would not take as it is."""
+    return [name for name in dict.fromkeys(names) if name.startswith(incomplete) and not _UNSAFE.search(name)]
 
 
 def _node_beginning(incomplete: str, paths: list[str]) -> list[str]:

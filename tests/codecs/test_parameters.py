@@ -16,6 +16,8 @@ from r2p.errors import DecodeError, MessageError
 ints = st.integers(-(1 << 63), (1 << 63) - 1)
 floats = st.floats(allow_nan=False)
 texts = st.text(max_size=60)
+nodes = st.from_regex(r"[A-Za-z0-9_]{1,64}", fullmatch=True)
+names = st.from_regex(r"[A-Za-z0-9_]{1,30}(\.[A-Za-z0-9_]{1,30})?", fullmatch=True)
 values: dict[ParameterKind, st.SearchStrategy[Any]] = {
     ParameterKind.BOOL: st.booleans(),
     ParameterKind.INT: ints,
@@ -33,8 +35,8 @@ def records(draw: st.DrawFn) -> ParameterRecord:
     value = values[kind]
     limit = st.none() | (ints if kind in (ParameterKind.INT, ParameterKind.INTS) else floats)
     return ParameterRecord(
-        node=draw(texts),
-        name=draw(texts),
+        node=draw(nodes),
+        name=draw(names),
         kind=kind.text,
         value=draw(value),
         default=draw(value),
@@ -100,6 +102,8 @@ def test_bytes_of_strangers_are_refused_or_read(data: bytes, more: st.DataObject
         (b"\1" + bytes(4) + b"\1\7\0\0\0\1a\1b\1\1\0", "a.b has no value"),
         (b"\1" + bytes(4) + b"\1\6\0\0\0\1a\1b\1\2", "a bool of 2"),
         (b"\1" + bytes(4) + b"\1\2\0\0\0\1\x80", "not UTF-8"),
+        (b"\1" + bytes(4) + b"\1\5\0\0\0\4$(x)", r"node name .*\$\(x\)"),
+        (b"\1" + bytes(4) + b"\1\5\0\0\0\1a\2b\n", "parameter name"),
     ],
 )
 def test_what_is_wrong_with_a_list(data: bytes, reason: str) -> None:

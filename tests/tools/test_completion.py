@@ -222,6 +222,11 @@ def test_parameters_are_completed(words: str, found: list[str], url: str) -> Non
     assert completions(f"r2p param {verb} --via {url} {' '.join(rest)}") == found
 
 
+def test_no_word_is_offered_that_a_shell_would_run_or_cut() -> None:
+    words = ["a/b.c", "a$(reboot)", "a b", "a\n", "a;b", "a`b`", "a\x1b", "a/?", "a/b.c"]
+    assert completion.beginning("a", words) == ["a/b.c", "a/?"]
+
+
 @pytest.mark.processes
 @pytest.mark.skipif(sys.platform != "linux", reason="pseudo terminals, and setsid")
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
