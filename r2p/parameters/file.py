@@ -50,7 +50,10 @@ class ParameterFile:
 
     async def load(self, module: str) -> dict[Name, object]:
         """Return what is saved for a module; nothing if there is no file yet. Raises ParameterError."""
-        return await _in_thread(lambda: self._load(module))
+        try:
+            return await _in_thread(lambda: self._load(module))
+        except OSError as error:
+            raise ParameterError(f"can't read parameters from {self.path}: {error.strerror or error}") from error
 
     async def save(self, module: str, changes: Mapping[Name, Plain | None]) -> dict[Name, object]:
         """Write changes (None: remove the entry), and return what the file has for the module then.

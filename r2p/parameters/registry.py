@@ -67,7 +67,8 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
     async def load(self) -> None:
         """Read the saved file, if the module has one. Raises ParameterError for one that can't be read."""
         if self._file is not None:
-            self._saved = await self._file.load(self._module)
+            async with self._saving:  # or what is saved meanwhile would count as unsaved
+                self._saved = await self._file.load(self._module)
             self._touch(self._parameters)
 
     def forget_run_time(self) -> None:

@@ -163,6 +163,9 @@ async def test_a_module_without_a_file_and_a_file_without_a_directory(tmp_path: 
     with pytest.raises(r2p.ParameterError, match=r"there is no directory .*nowhere"):
         async with r2p.Module("PC1", params_file=tmp_path / "nowhere" / "params.toml"):
             pass
+    with pytest.raises(r2p.ParameterError, match=r"can't read parameters from .*aaa: File name too long"):
+        async with r2p.Module("PC1", params_file=tmp_path / ("a" * 300)):
+            pass
 
 
 class Cut(BaseException):
