@@ -41,10 +41,11 @@ class CodeLoader:
     """Loads functions from the files of one directory, and from code that was sent."""
 
     def __init__(self, directory: Path) -> None:
-        """Raises Error if there is no such directory."""
+        """Raises Error if there is no such directory, or other users can write it."""
         self.directory = directory.resolve()
         if not self.directory.is_dir():
             raise Error(f"allow_load: there is no directory {directory}")
+        _check_owner(self.directory, self.directory.stat())
         self._known = {name: _signature(path) for name, path in self._own_modules()}
         """The state of the files of loaded modules, when they were loaded."""
         self._loading = asyncio.Lock()
@@ -57,6 +58,7 @@ class CodeLoader:
         """
         path = self._path(file)
         source = _read(path)
+        _check_owner(path.parent, path.parent.stat())  # it is imported from
         return await self._load(file, function, lambda: self._run_file(path, source))
 
     async def load_sent(self, name: str, code: bytes, function: str) -> NodeFunction:
@@ -76,7 +78,6 @@ class CodeLoader:
             raise Error(f"{file} is not in {self.directory}, and no other code may be loaded (--load-dir)")
         if not found:
             raise Error(f"there is no file {file} in {self.directory}, on the computer of the module")
-        _check_owner(path)
         if path.suffix != ".py":
             raise Error(f"{file} is not a Python file: its name must end with .py")
         return path
@@ -190,11 +191,10 @@ def _signature(path: Path) -> _Signature | None:
     return found.st_mtime_ns, found.st_size
 
 
-def _check_owner(path: Path) -> None:
-    """Raise Error for a file that another user than this one and root has written, or everyone can write."""
+def _check_owner(path: Path, status: os.stat_result) -> None:
+    """Raise Error for a file, or a directory, of another user than this one and root, or that everyone can write."""
     if os.name != "posix":
         return
-    status = path.stat()
     if status.st_uid not in {0, os.geteuid()} or status.st_mode & stat.S_IWOTH:
         raise Error(f"{path} belongs to another user, or everyone can write it: chown it, and chmod o-w")
 
@@ -202,6 +202,7 @@ def _check_owner(path: Path) -> None:
 def _read(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
+            _check_owner(path, os.fstat(file.fileno()))  # of this file: the path may lead to another one now
             source = file.read(CODE_MAX + 1)
     except OSError as error:
         raise Error(f"can't read {path}: {error.strerror}") from None
@@ -248,26 +249,23 @@ async def _in_thread(run: Callable[[], types.ModuleType]) -> types.ModuleType:
     loop = asyncio.get_running_loop()
     if clock_of(loop).virtual:
         return run()
-    result: asyncio.Future[types.ModuleType] = loop.create_future()
+    # With errors as results: a future does not take a StopIteration, and complains about one that is not awaited.
+    result: asyncio.Future[types.ModuleType | Exception] = loop.create_future()
 
-    def finish(module: types.ModuleType | None, error: Exception | None) -> None:
-        if result.done():
-            return
-        if module is not None:
-            result.set_result(module)
-        else:
-            result.set_exception(error or Error("nothing was loaded"))
+    def finish(outcome: types.ModuleType | Exception) -> None:
+        if not result.done():
+            result.set_result(outcome)
 
     def work() -> None:
-        module, error = None, None
+        outcome: types.ModuleType | Exception
         try:
-            module = run()
+            outcome = run()
         except Exception as raised:  # noqa: BLE001 - the user's code: it is raised again where it is awaited
-            error = raised
+            outcome = raised
         except BaseException as raised:  # noqa: BLE001 - SystemExit and the like would end the program there
-            error = Error(f"it raises {type(raised).__name__}: {raised}")
+            outcome = Error(f"it raises {type(raised).__name__}: {raised}")
         with contextlib.suppress(RuntimeError):  # the loop is closed
-            loop.call_soon_threadsafe(finish, module, error)
+            loop.call_soon_threadsafe(finish, outcome)
 
     threading.Thread(target=work, name="r2p-load", daemon=True).start()
     await asyncio.wait([result], timeout=_TIMEOUT)
@@ -276,4 +274,7 @@ async def _in_thread(run: Callable[[], types.ModuleType]) -> types.ModuleType:
         raise Error(
             f"the file still runs {_TIMEOUT:g} s after its start: what it does has to be in the node's function"
         )
-    return result.result()
+    outcome = result.result()
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome

@@ -183,12 +183,12 @@ class NodeControl:
             action = NodeAction(command.action)
         except ValueError:
             raise DecodeError(f"action {command.action} is unknown to this version of r2p") from None
-        return self._answer(self._carry_out(action, command, loader))
+        return self._answer(action, command, loader)
 
-    async def _answer(self, outcome: Awaitable[NodeOutcome]) -> bytes:
+    async def _answer(self, action: NodeAction, command: NodeCommand, loader: CodeLoader) -> bytes:
         """Return what came of a command; an error with all of its text, which may be a traceback."""
         try:
-            return encode_content(await outcome)
+            return encode_content(await self._carry_out(action, command, loader))
         except Error as error:
             return encode_content(NodeOutcome(error=_cut(str(error), _TEXT_MAX)))
 
@@ -248,8 +248,7 @@ def _known(supervisors: dict[str, Supervisor]) -> str:
 
 def _cut(text: str, most: int) -> str:
     """Return a text with at most so many bytes of UTF-8; of a long one, its end, where a traceback has its error."""
-    data = text.encode(errors="replace")
-    return text if len(data) <= most else data[-most:].decode(errors="ignore")
+    return text.encode(errors="replace")[-most:].decode(errors="ignore")
 
 
 def _processor_time() -> float:

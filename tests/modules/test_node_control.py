@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import importlib
 import logging
 import math
 import os
 import sys
 import threading
+import warnings
 import zlib
 from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING, Any
@@ -23,7 +25,14 @@ from r2p.codecs.own_services import PAGE_MAX, Operation
 from r2p.errors import DecodeError
 from r2p.modules import node_messages
 from r2p.modules.node_control import CodeStore, digest_of
-from r2p.modules.node_messages import CodePiece, NodeCommand, decode_argument, decode_content, encode_argument
+from r2p.modules.node_messages import (
+    CodePiece,
+    NodeAction,
+    NodeCommand,
+    decode_argument,
+    decode_content,
+    encode_argument,
+)
 from r2p.msg import Led, Log
 from r2p.testing.network import node_in
 from tests.bench import collect, hold
@@ -158,6 +167,8 @@ ERRORS = {
     "imports.py:blink": "(?s)can't load imports.py:.*No module named 'not_there'",
     "a\0b.py:blink": "is not a path",
     "big.py:blink": "has more than 256 KiB",
+    "loose.py:blink": "loose.py belongs to another user, or everyone can write it: chown it, and chmod o-w",
+    "open/blink.py:blink": "/open belongs to another user, or everyone can write it",
 }
 
 
@@ -177,6 +188,11 @@ async def test_what_is_wrong_with_a_file_reaches_the_user(directory: Path) -> No
         (directory / f"{name}.py").rename(inner / f"{name}.py")
     write(inner / "blink.py", BLINK.replace("from helper_of_blink import VALUE", "VALUE = 1"))
     write(inner / "helper_of_blink.py", "VALUE = 1\n")
+    write(inner / "loose.py", BLINK)
+    (inner / "loose.py").chmod(0o646)
+    (inner / "open").mkdir()
+    write(inner / "open" / "blink.py", BLINK)
+    (inner / "open").chmod(0o757)  # whoever can write there chooses what blink.py imports
     async with AsyncExitStack() as stack:
         bot = await stack.enter_async_context(host(inner))
         nodes = await nodes_of(stack)
@@ -190,6 +206,48 @@ async def test_what_is_wrong_with_a_file_reaches_the_user(directory: Path) -> No
             await nodes.swap("blink", "blink.py", "crash")
         assert not {"syntax", "raises", "exits", "imports", "helper_of_blink"} & (set(sys.modules) - modules)
         assert bot.nodes["blink"].running
+    with pytest.raises(r2p.Error, match="/open belongs to another user"):
+        host(inner / "open")
+
+
+@virtual_time
+async def test_an_error_with_any_characters_is_listed_and_a_command_that_never_runs_leaves_nothing(
+    directory: Path,
+) -> None:
+    async with AsyncExitStack() as stack:
+        bot = await stack.enter_async_context(host(directory))
+        nodes = await nodes_of(stack)
+        await nodes.start("blink.py", "blink")
+        bot.nodes["blink"].error = OSError("x\udcff" * 200)
+        (listed,) = (await nodes.fetch()).nodes
+        assert listed.error == "x?" * 150
+        bot.nodes["blink"].error = None
+        with warnings.catch_warnings(record=True) as found:
+            command = NodeCommand(action=NodeAction.STOP, node="blink")
+            bot._node_control._command(encode_argument(command)).close()  # as where too many run
+            gc.collect()
+        assert not found
+
+
+@virtual_time
+@pytest.mark.parametrize("order", [r2p.Module.stop, r2p.Module.reboot])
+async def test_a_restart_that_waits_does_not_start_a_node_that_is_stopped(order: Any) -> None:
+    async def slow(node: r2p.Node) -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.sleep(1.0)
+
+    async with r2p.Module("BOT", via="memory:a") as bot:
+        bot.start(slow)
+        await asyncio.sleep(0.1)
+        restarting = asyncio.create_task(bot.restart_node("slow"))
+        await asyncio.sleep(0.1)
+        await order(bot)
+        with pytest.raises(r2p.Error, match="node slow of module BOT was replaced or ended while it was restarted"):
+            await restarting
+        await asyncio.sleep(0.1)
+        assert bot.nodes["slow"].running is not bot.stopped
 
 
 @virtual_time
@@ -459,5 +517,8 @@ async def load_in_thread(directory: Path) -> None:
         assert threading.get_ident() != sys.modules["slow"].THREAD
         write(directory / "slow.py", "raise KeyError(3)\n")
         with pytest.raises(r2p.Error, match="KeyError: 3"):
+            await bot.network.nodes_of("BOT").start("slow.py", "wait", "again")
+        write(directory / "slow.py", "next(iter(()))\n")
+        with pytest.raises(r2p.Error, match=r"(?s)line 1, in <module>.*StopIteration"):
             await bot.network.nodes_of("BOT").start("slow.py", "wait", "again")
         await bot.stop_node("wait")
