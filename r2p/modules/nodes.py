@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 logger = get_logger("r2p.module")
 
+_NAME = "name (name=, or FILE:FUNCTION=NAME)"
+
 CLEANUP_WARNING_AFTER = 1.0
 """Seconds after which the log names nodes that are still cleaning up."""
 
@@ -94,7 +96,7 @@ class NodeTable:
         supervisor = self._supervisor(function, args, name, options)
         name = supervisor.node.name
         if self._is_taken(name):
-            raise Error(f"module {self._module} already has a node {name}: give this one another name=")
+            raise Error(f"module {self._module} already has a node {name}: give this one another {_NAME}")
         self.supervisors[name] = supervisor
         self._start(supervisor)
         return supervisor.node
@@ -133,7 +135,7 @@ class NodeTable:
             raise Error(f"node {old} of module {self._module} does not run: start the new one instead")
         name = old if name is None else node_name(name)
         if name != old and self._is_taken(name):
-            raise Error(f"module {self._module} already has a node {name}: give the new one another name=")
+            raise Error(f"module {self._module} already has a node {name}: give the new one another {_NAME}")
         new = self._supervisor(function, args, name, msgspec.structs.replace(before.options, **options))
         swap = NodeSwap(before, new, self.links, limits, self._replace)
         self._start(new)

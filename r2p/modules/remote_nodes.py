@@ -158,7 +158,9 @@ class RemoteNodes:
     async def _command(self, command: NodeCommand) -> NodeOutcome:
         outcome = await self._get(NodeOutcome, Operation.NODE_COMMAND, encode_argument(command))
         if outcome.error:
-            raise Error(f"{self.module}: {outcome.error}")
+            own = f"module {self.module} "  # with which some texts begin
+            text = outcome.error.removeprefix("module ")
+            raise Error(text if outcome.error.startswith(own) else f"{self.module}: {outcome.error}")
         return outcome
 
     async def _get(self, kind: type[M], operation: Operation, argument: bytes = b"") -> M:

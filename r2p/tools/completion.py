@@ -22,6 +22,7 @@ import typer
 from r2p.codecs.services import REQUESTS, is_of_service
 from r2p.tools.config import find as find_config
 from r2p.tools.config import read as read_config
+from r2p.tools.node_states import node_lists, r2p_modules
 from r2p.tools.session import IN_ONE_PROGRAM, Session, Settings, join, settings, wait_until
 from r2p.tools.types import STANDARD, Types, standard_types, type_name
 
@@ -30,6 +31,7 @@ Source = Callable[[Session], Awaitable[Iterable[str]]]
 
 _LINK_UP = 1.0  # seconds to wait for a link
 _LISTEN = 0.9  # seconds to listen for announcements at most; r2p modules answer at once
+_ANSWERS = 0.5  # seconds to wait for the answers of modules
 _LIMIT = 3.0  # seconds after which the process ends: a host name may take longer to look up, and can't be interrupted
 _UNSAFE = re.compile(r"[^\w./:?=,@+-]")  # in words of a network: shells replace, run or cut at it
 _BREAKS = re.compile(r"[:=@]+")  # a word of its own in bash, even between two parts of one
@@ -136,7 +138,9 @@ async def modules(session: Session) -> list[str]:
 
 async def nodes(session: Session) -> list[str]:
     """Return `MODULE/NODE` of all nodes except for those of tools."""
-    return [f"{module}/{node}" for module, node in session.module.network.nodes() if not module.startswith("_")]
+    announced = [f"{module}/{node}" for module, node in session.module.network.nodes() if not module.startswith("_")]
+    lists = await node_lists(session, r2p_modules(session), within=_ANSWERS)  # also those without topics
+    return [*announced, *(f"{module}/{each.node}" for module, found in lists.items() for each in found.nodes)]
 
 
 def on_network(ctx: typer.Context, source: Source) -> list[str]:

@@ -16,7 +16,7 @@ import r2p
 from r2p.msg import Log
 from r2p.names import LOG
 from r2p.tools.completion import complete_node_or_module
-from r2p.tools.log_levels import set_levels
+from r2p.tools.log_levels import complete_level, set_levels
 from r2p.tools.options import Count, Format, Once, Timeout
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, joined, patience
@@ -63,6 +63,7 @@ async def log(
         typer.Option(
             "--set",
             metavar="NODE=LEVEL",
+            autocompletion=complete_level,
             help="Set from which level on NODE, MODULE/NODE or MODULE/* logs, and end; default: as at its start.",
         ),
     ] = None,

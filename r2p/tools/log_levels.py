@@ -1,10 +1,12 @@
 """`r2p log --set NODE=LEVEL`: set from which level on nodes log, while they run."""
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
-import r2p
-from r2p.tools.node_states import find_module, node_lists, r2p_modules
+import typer
+
+from r2p.tools.completion import beginning, complete_node
+from r2p.tools.node_states import find_module, module_of
 from r2p.tools.output import notify
 from r2p.tools.session import Session, TimedOut, UsageError
 
@@ -20,6 +22,12 @@ LEVELS: dict[str, int | None] = {
 _ALL = "*"
 
 
+def complete_level(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Completions for NODE=LEVEL: the node, and behind it the level."""
+    node, found, _ = incomplete.partition("=")
+    return beginning(incomplete, [f"{node}={level}" for level in LEVELS]) if found else complete_node(ctx, incomplete)
+
+
 async def set_levels(session: Session, given: Iterable[str]) -> None:
     """Set the levels in texts `NODE=LEVEL`, `MODULE/NODE=LEVEL` or `MODULE/*=LEVEL`, and say for which nodes.
 
@@ -29,8 +37,7 @@ async def set_levels(session: Session, given: Iterable[str]) -> None:
         raise UsageError("no network to look for nodes on: give --via tcp:HOST:PORT or set R2P_VIA")
     for module, node, level in [_parse(each) for each in given]:  # all of them before anything is set
         if not module:
-            await session.settle()
-            module = await _module_of(session, node)
+            module = await module_of(session, node)
         nodes = await find_module(session, module)
         try:
             names = await nodes.set_log_level("" if node == _ALL else node, LEVELS[level])
@@ -56,21 +63,3 @@ def _parse(text: str) -> tuple[str, str, str]:
     if node == _ALL and not module:
         raise UsageError(f"--set {text}: of which module? Write MODULE/*={level}")
     return module, node, level.lower()
-
-
-async def _module_of(session: Session, node: str) -> str:
-    """Return the only module that has a node. Raises r2p.Error if there is none, or there are several."""
-    lists = await node_lists(session, r2p_modules(session))
-    modules = list(_with_node(lists, node))
-    if len(modules) == 1:
-        return modules[0]
-    if modules:
-        raise r2p.Error(
-            f"there are several nodes {node}: choose one of {', '.join(f'{each}/{node}' for each in modules)}"
-        )
-    known = ", ".join(f"{module}/{each.node}" for module, found in lists.items() for each in found.nodes)
-    raise r2p.Error(f"there is no node {node} whose log level can be set; nodes found: {known or 'none'}")
-
-
-def _with_node(lists: dict[str, r2p.NodeList], node: str) -> Iterator[str]:
-    return (module for module, found in lists.items() if any(each.node == node for each in found.nodes))

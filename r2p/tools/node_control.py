@@ -8,16 +8,26 @@ import typer
 
 import r2p
 from r2p.names import module_path, node_name
-from r2p.tools.completion import complete_module, complete_node_of_module
-from r2p.tools.node_states import find_module
+from r2p.tools.completion import complete_module, complete_node_of_module, complete_node_or_module
+from r2p.tools.node_states import find_module, find_node, is_module
 from r2p.tools.options import CLASS_NAMES, Format
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, TimedOut, UsageError
 
 T = TypeVar("T")
 
-ModuleName = Annotated[str, typer.Argument(metavar="MODULE", autocompletion=complete_module, show_default=False)]
-NodeName = Annotated[str, typer.Argument(metavar="NODE", autocompletion=complete_node_of_module, show_default=False)]
+NodePath = Annotated[
+    str,
+    typer.Argument(
+        metavar="MODULE/NODE",
+        autocompletion=complete_node_or_module,
+        help="NODE alone if the name is unique; or MODULE NODE, in two arguments.",
+        show_default=False,
+    ),
+]
+NodeName = Annotated[
+    str | None, typer.Argument(metavar="NODE", autocompletion=complete_node_of_module, show_default=False)
+]
 Target = Annotated[
     str,
     typer.Argument(
@@ -62,7 +72,15 @@ class _Code:
 
 async def start(
     session: Session,
-    module: ModuleName,
+    module: Annotated[
+        str,
+        typer.Argument(
+            metavar="MODULE[/NAME]",
+            autocompletion=complete_module,
+            help="NAME is that of the new node; default: that of its function.",
+            show_default=False,
+        ),
+    ],
     target: Target,
     *,
     send: Send = False,
@@ -71,7 +89,8 @@ async def start(
 ) -> None:
     """Start a node in a module that runs with --allow-load."""
     code = _Code(target, send=send)
-    nodes = await _find(session, module)
+    nodes = await _find_place(session, module, code)
+    module = nodes.module
     starting = nodes.start(
         code.file,
         code.function,
@@ -86,38 +105,46 @@ async def start(
     notify(f"{module}: node {name} runs")
 
 
-async def stop(session: Session, module: ModuleName, node: NodeName) -> None:
+async def stop(session: Session, module: NodePath, node: NodeName = None) -> None:
     """End one node, and wait for its clean-up; the others run on. Start it again with restart."""
-    nodes = await _find(session, module)
-    with session.waiting(f"the end of {node}"):
-        await _answered(nodes.stop(node))
-    notify(f"{module}: node {node} has ended")
+    nodes, name = await find_node(session, module, node)
+    with session.waiting(f"the end of {name}"):
+        await _answered(nodes.stop(name))
+    notify(f"{nodes.module}: node {name} has ended")
 
 
-async def restart(session: Session, module: ModuleName, node: NodeName) -> None:
+async def restart(session: Session, module: NodePath, node: NodeName = None) -> None:
     """End one node and start its function again.
 
     It runs the code that was loaded for it: to run a changed file, swap it.
     """
-    nodes = await _find(session, module)
-    with session.waiting(f"the end of {node}"):
-        await _answered(nodes.restart(node))
-    notify(f"{module}: node {node} runs again")
+    nodes, name = await find_node(session, module, node)
+    with session.waiting(f"the end of {name}"):
+        await _answered(nodes.restart(name))
+    notify(f"{nodes.module}: node {name} runs again")
 
 
 async def swap(
     session: Session,
-    module: ModuleName,
-    old: Annotated[
+    module: Annotated[
         str,
         typer.Argument(
-            metavar="OLD",
-            autocompletion=complete_node_of_module,
-            help="The node to replace.",
+            metavar="MODULE[/OLD]",
+            autocompletion=complete_node_or_module,
+            help="The node to replace; OLD may be an argument of its own, or stand alone if the name is unique.",
             show_default=False,
         ),
     ],
-    target: Target,
+    old: Annotated[
+        str,
+        typer.Argument(
+            metavar="OLD|FILE:FUNCTION[=NAME]",
+            autocompletion=complete_node_of_module,
+            help="OLD behind MODULE alone. A file of the module's computer, relative to its --load-dir.",
+            show_default=False,
+        ),
+    ],
+    target: Annotated[str | None, typer.Argument(metavar="FILE:FUNCTION[=NAME]", show_default=False)] = None,
     *,
     send: Send = False,
     partial: Annotated[
@@ -132,12 +159,14 @@ async def swap(
     of each topic is printed: of a periodic one, from the last message of the old node to the first one of the new node.
     """
     output = Output(format)
-    code = _Code(target, send=send)
-    nodes = await _find(session, module)
+    node = old if target is not None else None
+    code = _Code(old if target is None else target, send=send)
+    nodes, name = await find_node(session, module, node)
+    module = nodes.module
     swapping = nodes.swap(
-        old, code.file, code.function, code.name, code=code.sent, partial=partial, progress=code.progress
+        name, code.file, code.function, code.name, code=code.sent, partial=partial, progress=code.progress
     )
-    with session.waiting(lambda: code.awaited(f"{module} to swap {old}")):
+    with session.waiting(lambda: code.awaited(f"{module} to swap {name}")):
         result = await _answered(swapping)
     if not result.cleaned_up:
         notify(f"the old node still cleans up: it hangs, and can't publish any more; see the log of {module}")
@@ -173,9 +202,16 @@ def _ms(seconds: float) -> str:
     return f"{seconds * 1e3:.4g} ms"
 
 
-async def _find(session: Session, module: str) -> r2p.RemoteNodes:
+async def _find_place(session: Session, module: str, code: _Code) -> r2p.RemoteNodes:
+    """Return the nodes of `MODULE`, or of the one of `MODULE/NAME`, and note NAME."""
     module_path(module)
-    return await find_module(session, module)
+    above, _, name = module.rpartition("/")
+    if not above or await is_module(session, module) or not await is_module(session, above):
+        return await find_module(session, module)
+    if code.name not in {"", name}:
+        raise UsageError(f"one node has one name: {module} or ={code.name}")
+    code.name = node_name(name)
+    return session.module.network.nodes_of(above)
 
 
 async def _answered(change: Awaitable[T]) -> T:

@@ -154,7 +154,7 @@ async def test_what_start_refuses() -> None:
 
     async with local() as module:
         module.start(hold)
-        with pytest.raises(r2p.Error, match="module PC1 already has a node hold: give this one another name="):
+        with pytest.raises(r2p.Error, match=r"module PC1 already has a node hold: give this one another name \(name="):
             module.start(hold)
         much_too_long.__name__ = "much_" + "too_" * 15 + "long"
         with pytest.raises(r2p.NameTooLong, match=r"has 69 characters.* pass name='much_(too_)*too'"):

@@ -106,8 +106,12 @@ async def drive(node: r2p.Node) -> None:
 
 @pytest.mark.virtual_time
 async def test_names_of_the_network() -> None:
-    """Tools are not offered, nor the topics of services."""
-    async with robot(drive), robot(drive, name="ARM"), tool() as other:
+    """Tools are not offered, nor the topics of services; nodes without a topic are."""
+
+    async def idle(_node: r2p.Node) -> None:
+        pass
+
+    async with robot(drive, idle), robot(drive, name="ARM"), tool() as other:
         other.node.advertise("leds", Led)
         start = asyncio.get_running_loop().time()
         found = {
@@ -119,9 +123,13 @@ async def test_names_of_the_network() -> None:
         "topics": ["encoder", "leds", "log"],
         "services": ["add"],
         "modules": ["ARM", "BOT"],
-        "nodes": ["ARM/drive", "ARM/log", "BOT/drive", "BOT/log"],
+        "nodes": ["ARM/drive", "ARM/log", "BOT/drive", "BOT/idle", "BOT/log"],
     }
     assert taken < 4 * 0.5, "it ends as soon as everything has been announced"
+
+
+def test_a_level_behind_its_node() -> None:
+    assert completions("r2p log --set BOT/drive=de") == ["BOT/drive=debug", "BOT/drive=default"]
 
 
 @pytest.mark.virtual_time

@@ -78,6 +78,40 @@ async def test_from_start_to_end(directory: Path, capsys: pytest.CaptureFixture[
 
 
 @virtual_time
+async def test_a_node_in_one_argument(directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As in `r2p node info`: MODULE/NODE, or NODE if one module has it."""
+    async with (
+        bot(directory) as module,
+        r2p.Module("ARM", via=VIA, allow_load=directory) as arm,
+        tool() as session,
+    ):
+        await node_control.start(session, "BOT/left", "robot_nodes.py:blink")
+        await node_control.start(session, "ARM", "robot_nodes.py:blink")
+        await node_control.swap(session, "BOT/left", "robot_nodes.py:blink=right")
+        await node_control.restart(session, "right")
+        assert [*module.nodes] == ["right"]
+        await node_control.stop(session, "BOT/right")
+        await node_control.stop(session, "ARM/blink")
+        assert [module.nodes["right"].running, arm.nodes["blink"].running] == [False, False]
+        await node_control.start(session, "BOT/blink", "robot_nodes.py:blink=blink")
+        capsys.readouterr()
+        with pytest.raises(
+            UsageError, match="BOT is a module: name one of its nodes as MODULE/NODE; it has: BOT/right"
+        ):
+            await node_control.stop(session, "BOT")
+        with pytest.raises(r2p.Error, match=r"no node blnk in an r2p module; nodes .*; did you mean blink\?"):
+            await node_control.stop(session, "blnk")
+        with pytest.raises(r2p.Error, match="several nodes blink: choose one of ARM/blink, BOT/blink"):
+            await node_control.restart(session, "blink")
+        with pytest.raises(UsageError, match="one node has one name: BOT/left or =right"):
+            await node_control.start(session, "BOT/left", "robot_nodes.py:blink=right")
+        with pytest.raises(UsageError, match=r"blink: write it as FILE:FUNCTION"):
+            await node_control.swap(session, "BOT", "blink")
+        with pytest.raises(TimedOut, match="there is no module LEG/left"):
+            await node_control.start(session, "LEG/left", "robot_nodes.py:blink")
+
+
+@virtual_time
 async def test_a_crash_is_listed_with_its_error(directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
     module = r2p.Module("BOT", via=VIA, allow_load=directory)
     async with tool() as session:
@@ -126,7 +160,7 @@ async def test_what_can_not_be(directory: Path) -> None:
             await node_control.start(session, "BOT", f"{directory}/robot_nodes.py:blink", send=True)
         with pytest.raises(TimedOut, match="there is no module ARM on memory:lab; modules found: BOT, PC1"):
             await node_control.stop(session, "ARM", "blink")
-        with pytest.raises(r2p.Error, match="BOT: module BOT has no node blink; its nodes: none"):
+        with pytest.raises(r2p.Error, match=r"^BOT has no node blink; its nodes: none"):
             await node_control.stop(session, "BOT", "blink")
         with pytest.raises(
             r2p.Error, match=r"PC1 refuses to start, end and swap nodes for other modules: start it with"
