@@ -387,7 +387,8 @@ class DirectoryRelay:
     def _desired(self, port: BridgePort, key: _Key) -> _Announced | None:
         """Return the part of a fact that others on this link are to know, if any."""
         sources = self._sources.get(key, {})
-        names = [name for name in sources if name != port.name]
+        # A link that is gone keeps its facts here until it is looked at, which may come after a repetition.
+        names = [name for name in sources if name != port.name and name in self._ports]
         if not names:
             return None
         name = min(names, key=lambda each: sources[each].rank)

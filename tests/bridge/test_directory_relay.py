@@ -11,6 +11,7 @@ from r2p.codecs import management
 from r2p.msg import Led
 from r2p.testing.network import node_in
 from r2p.transports.memory import MemoryLink, MemoryTransport
+from r2p.units import SECOND
 from tests.bridge.test_bridge import Tap, gateway, node
 
 pytestmark = pytest.mark.virtual_time
@@ -111,6 +112,21 @@ async def test_nodes_of_a_network_that_a_gateway_joins_later_are_told() -> None:
         async with gateway(name="G2", networks="bc"), r2p.Module("C", via="memory:c") as c:
             await asyncio.sleep(3)
             assert [(each.module, each.node) for each in c.network.topics()["leds"].publishers] == [("A", "test")]
+
+
+async def test_a_link_that_is_gone_may_be_looked_at_after_a_repetition() -> None:
+    """A gateway that has much to do looks at its links later, and answers queries meanwhile."""
+    async with gateway() as gw, node("A", "a"), r2p.Module("B", via="memory:b") as b:
+        await asyncio.sleep(3.2)
+        bridge = gw._link_manager.bridge if gw._link_manager is not None else None
+        assert bridge is not None
+        (first, _) = gw.links
+        bridge.directory._next_round_at = bridge.directory._clock.monotonic() + 2 * SECOND
+        bridge.detach(first)
+        b.query()
+        await asyncio.sleep(1.0)  # an internal error would fail the test
+        assert "A" not in {view.name for view in b.network.modules()}
+        bridge.attach(first)  # so that the module can end as usual
 
 
 async def test_a_link_that_comes_later_is_told_what_was_known_before() -> None:
