@@ -107,6 +107,15 @@ class Deployment:
             raise self._failure(error) from error
         return await self._load_all(empty)
 
+    @property
+    def lost(self) -> str:
+        """What the module has lost so far, with the config of apps that are not loaded again; empty: nothing."""
+        if not self._erased:
+            return ""
+        done = {each.app.name for each in self._loaded}
+        kept = {name: state.config.hex() for name, state in self._kept.items() if name not in done and state.config}
+        return "; its apps were removed" + "".join(f", {name} with config {data}" for name, data in kept.items())
+
     async def _state_of(self, app: InstalledApp) -> _KeptState:
         flags = await self._client.get(app.name, FLAGS_WORD, FLAGS_SIZE)
         length = app.outcome.cfglen
@@ -142,7 +151,7 @@ class Deployment:
             ours = {app.name for app in self._apps}
             while (apps := (await self._client.list_apps()).apps) and apps[-1].name in ours:
                 await remove_last(self._client, apps[-1].name)
-        except LoaderFault as error:
+        except LoaderError as error:
             raise self._failure(error) from fault
         self._loaded.clear()
 
@@ -207,9 +216,7 @@ class Deployment:
         link = "" if self._client.connected else ", and its link is down"
         text = f"{error}{link}. {module} was left in its boot loader, without {', '.join(rest) or 'the last change'}"
         text += f" and with {', '.join(done)}" if done else ""
-        if self._erased:
-            lost = {name: state.config.hex() for name, state in self._kept.items() if name in rest and state.config}
-            text += "; its apps were removed" + "".join(f", {name} with config {data}" for name, data in lost.items())
+        text += self.lost
         check = "Check its link, look" if isinstance(error, LoaderFault) else "Look"
         text += f". {check} at r2p app list {module}, and load again what is missing"
         return LoaderSilent(text) if isinstance(error, LoaderSilent) else LoaderError(text)

@@ -76,8 +76,8 @@ class ElfContent(msgspec.Struct):
         return sorted((each for each in self.sections.values() if each.part == part), key=lambda each: each.rank)
 
     def find(self, name: str) -> ElfSymbol | None:
-        """Return the symbol of this name that is defined in the file."""
-        return next((each for each in self.symbols if each.name == name and isinstance(each.section, int)), None)
+        """Return the symbol of this name that is defined in one of the sections."""
+        return next((each for each in self.symbols if each.name == name and each.section in self.sections), None)
 
 
 def read_content(path: Path) -> ElfContent:
@@ -119,14 +119,16 @@ def _content(elf: Any) -> ElfContent:
     if elf["e_type"] not in ("ET_REL", "ET_EXEC"):
         raise AppFileError(f"it is neither relocatable nor executable, but {elf['e_type']}: link it by ld -r")
     content = ElfContent(elf["e_type"] == "ET_REL", {}, [], [])
-    tables = []
+    tables, size = [], 0
     for index, each in enumerate(elf.iter_sections()):
         kind = each["sh_type"]
         if kind == "SHT_SYMTAB":
             content.symbols = _symbols(each)
         elif kind in ("SHT_REL", "SHT_RELA"):
             tables.append(each)
-        elif each["sh_flags"] & _ALLOCATED and each["sh_size"] and not each.name.startswith(_LEFT_OUT):
+        elif each["sh_flags"] & _ALLOCATED and each.data_size and not each.name.startswith(_LEFT_OUT):
+            if (size := size + each.data_size) > SIZE_MAX:
+                raise AppFileError(f"its sections up to {each.name} have {size} bytes, more than any module has")
             content.sections[index] = _section(each, index)
     if content.relocatable:
         content.relocations = [one for each in tables for one in _relocations(each, content)]
@@ -134,15 +136,13 @@ def _content(elf: Any) -> ElfContent:
 
 
 def _section(section: Any, index: int) -> ElfSection:
-    name, kind, size = section.name, section["sh_type"], section["sh_size"]
-    if size > SIZE_MAX:
-        raise AppFileError(f"{name} has {size} bytes, more than any module has")
+    name, kind, size = section.name, section["sh_type"], section.data_size
     writable = section["sh_flags"] & (_WRITE | _EXECUTABLE) == _WRITE and kind not in ARRAYS
     part: Part = "bss" if kind == "SHT_NOBITS" else "data" if writable else "program"
     data = b"" if part == "bss" else section.data()
     if part != "bss" and len(data) != size:
         raise AppFileError(f"{name} is cut short")
-    align = max(1, section["sh_addralign"])
+    align = max(1, section.data_alignment)
     return ElfSection(name, kind, part, align, size, data, section["sh_addr"], _rank(section, index))
 
 
@@ -168,6 +168,8 @@ def _relocations(table: Any, content: ElfContent) -> list[ElfRelocation]:
     target = table["sh_info"]
     if target not in content.sections:  # of debugging, or left out
         return []
+    if content.sections[target].part == "bss":
+        raise AppFileError(f"{table.name} changes {content.sections[target].name}, which has no content")
     if table.is_RELA():
         raise AppFileError(f"{table.name} has explicit addends, which ARM does not use")
     found = [

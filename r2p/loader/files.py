@@ -20,12 +20,12 @@ def read_app(path: Path, given: dict[str, Any] | None = None) -> AppImage:
     `given` replaces what the description says. Raises AppFileError for files that are not as they should be, and Error
     if a package for their format is missing.
     """
-    description = _read_description(path, given or {})
     try:
         with path.open("rb") as file:
             is_elf = file.read(len(_ELF)) == _ELF
     except OSError as error:
         raise AppFileError(f"can't read {path}: {error.strerror}") from error
+    description = _read_description(path, given or {})
     return read_elf(path, description) if is_elf else _read_hex(path, description)
 
 
@@ -38,11 +38,11 @@ def _read_description(path: Path, given: dict[str, Any]) -> AppDescription:
         return msgspec.convert(content | given, AppDescription)
     except OSError as error:
         raise AppFileError(f"can't read {beside}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise AppFileError(f"{beside}: {error}") from error
     except msgspec.ValidationError as error:
         known = ", ".join(AppDescription.__struct_fields__)
         raise AppFileError(f"{beside}: {error}; an app's description has {known}") from error
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, numbers of thousands of digits, deep arrays
+        raise AppFileError(f"{beside}: {error}") from error
 
 
 def _read_hex(path: Path, description: AppDescription) -> FixedApp:

@@ -3,6 +3,9 @@
 A laser scanner measures as many ranges each time. When two messages in a row have the same counts, `decode` keeps one
 `struct.Struct` for messages of their size, which unpacks all runs at once. It still compares each count: the first one
 is at the same place in every message, and each further one is where it is expected if those before it are right.
+
+Threads may decode messages of one class at the same time: all of them share what is kept, none relies on what it was a
+moment ago.
 """
 
 import struct
@@ -18,18 +21,19 @@ _SIZES_MAX = 16  # sizes with a struct: more than the scanners of a robot have
 _ELEMENTS_MIN = 2  # arrays and texts of a message for which one struct is faster
 
 _DECODE = """
-if size in sizes:
-    unpack, {expected} = sizes[size]
+if known := find(size):
+    unpack, {expected} = known
     {slots}, = unpack(data)
     if {equal}:
         {read}
         return {value}
 """
 _LEARN = """
-if recent == [{counts}]:
-    learn(size, recent)
+counts = {counts}
+if recent[0] == counts:
+    learn(size, counts)
 else:
-    recent[:] = {counts}
+    recent[0] = counts
 """
 
 
@@ -61,11 +65,12 @@ class KnownLengths:
         self._slots: list[str] = []
         self._has_parts = False
         self._sizes: dict[int, tuple[Any, ...]] = {}
+        self._recent: list[tuple[int, ...]] = [()]  # the counts of the last message that was not of a known size
 
     @property
     def names(self) -> dict[str, Any]:
         """The names that the source uses."""
-        return {"sizes": self._sizes, "recent": [], "learn": self._learn}
+        return {"find": self._sizes.get, "recent": self._recent, "learn": self._learn}
 
     def add_run(self, formats: list[str], slots: list[str]) -> None:
         """Add fields of fixed size."""
@@ -108,7 +113,7 @@ class KnownLengths:
         learn = _LEARN.format(counts=", ".join(each.count for each in elements))
         return fast.strip().splitlines(), learn.strip().splitlines()
 
-    def _learn(self, size: int, counts: list[int]) -> None:
+    def _learn(self, size: int, counts: tuple[int, ...]) -> None:
         """Keep the struct of messages of this size with these counts, which a message had that was decoded."""
         expected = iter(counts)
         formats, places, at = [], [], 0

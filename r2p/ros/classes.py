@@ -57,6 +57,10 @@ _TIME_NAMES: dict[int, dict[type[Message], str]] = {
 }
 HEADER = "std_msgs/Header"
 
+_DEPTH_MAX = 32  # types in one another
+_FIELDS_MAX = 4096  # of a type, with those of all types in it; the largest of ROS have some hundred
+_VALUES_MAX = 1 << 20  # the same, each element of an array of fixed length counted
+
 
 @functools.cache
 def standard_classes() -> dict[str, type[Message]]:
@@ -79,25 +83,49 @@ class RosTypes:
         self._definitions = definitions
         self._known = standard_classes() if known is None else known
         self._classes: dict[str, type[Message]] = {}
+        self._extents: dict[str, tuple[int, int]] = {}
 
     def load(self, name: str, outer: tuple[str, ...] = ()) -> type[Message]:
         """Return the class of a type (`package/Name`), which is nested in the types `outer`.
 
-        Raises MessageError for a type whose definition is missing, or that r2p has no class for.
+        Raises MessageError for a type whose definition is missing, that r2p has no class for, or that is far larger
+        than any of ROS: a definition of a few lines may mean 10 GB.
         """
         if name in TIMES:
             return TIMES[name]
         if name == HEADER:  # that of ROS 2 has a field less
             return self._known.get(name, r2p.msg.Header)
         if name not in self._classes:
+            self._extent(name, outer)
             self._classes[name] = self._make(find(name, self._definitions, outer), outer)
         return self._classes[name]
+
+    def _extent(self, name: str, outer: tuple[str, ...]) -> tuple[int, int]:
+        """Return the numbers of fields and of values that a type has. Raises MessageError if these are too many."""
+        if name in TIMES or name == HEADER:
+            return 1, 1
+        if name not in self._extents:
+            if len(outer) > _DEPTH_MAX:
+                raise MessageError(f"{outer[0]} has more than {_DEPTH_MAX} types in one another, down to {name}")
+            fields = values = 0
+            for field in find(name, self._definitions, outer).fields:
+                kind = field.type
+                inner = (1, 1) if kind.is_builtin else self._extent(kind.base, (*outer, name))
+                fields += inner[0]
+                values += inner[1] * (kind.count or 1 if kind.has_fixed_count else 1)
+            for count, most, what in ((fields, _FIELDS_MAX, "fields"), (values, _VALUES_MAX, "values")):
+                if count > most:
+                    raise MessageError(f"{name} has {count} {what} with all types in it, more than {most}")
+            self._extents[name] = fields, values
+        return self._extents[name]
 
     def _make(self, definition: MessageDefinition, outer: tuple[str, ...]) -> type[Message]:
         hints: dict[str, Any] = {}
         members: dict[str, Any] = {"__annotations__": hints, "__module__": __name__}
         for field in definition.fields:
             name = f"{field.name}_" if is_reserved(field.name) else field.name
+            if name in hints:
+                raise MessageError(f"{definition.name}: a class can't have both fields {name.rstrip('_')} and {name}")
             hints[name], members[name] = self._field(field.type, (*outer, definition.name))
         name = definition.name.rpartition("/")[2]
         made = cast("type[Message]", MessageMeta(name, (Message,), members, name=definition.name))

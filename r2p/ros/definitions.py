@@ -10,6 +10,7 @@ Names of types are `package/Name` here, as in ROS 1; ROS 2 puts the kind of file
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
@@ -107,8 +108,7 @@ def parse(name: str, text: str) -> dict[str, MessageDefinition]:
     Raises MessageError, which names the type and the line, for a text that is not a definition.
     """
     name = short_name(name)
-    if len(text) > TEXT_MAX:
-        raise MessageError(f"the definition of {name} has {len(text)} characters, more than {TEXT_MAX}")
+    _check_length(name, text)
     first, *rest = re.split(rf"^={{{len(SEPARATOR)}}}[ \t]*\n", text, flags=re.MULTILINE)
     if len(rest) > _NESTED_MAX:
         raise MessageError(f"the definition of {name} has {len(rest)} nested types, more than {_NESTED_MAX}")
@@ -135,10 +135,16 @@ def parse_action(name: str, text: str) -> tuple[MessageDefinition, MessageDefini
 
 
 def _parts(name: str, text: str, kinds: list[str], joint: str) -> Iterator[MessageDefinition]:
+    _check_length(name, text)
     parts = re.split(r"^---[ \t]*$\n?", text, flags=re.MULTILINE)
     if len(parts) != len(kinds):
         raise MessageError(f"{name} has {len(parts) - 1} lines of ---, not {len(kinds) - 1}")
     return (_parse_one(f"{short_name(name)}{joint}{kind}", part) for kind, part in zip(kinds, parts, strict=True))
+
+
+def _check_length(name: str, text: str) -> None:
+    if len(text) > TEXT_MAX:
+        raise MessageError(f"the definition of {name} has {len(text)} characters, more than {TEXT_MAX}")
 
 
 def short_name(name: str) -> str:
@@ -165,8 +171,8 @@ def _parse_one(name: str, text: str) -> MessageDefinition:
             fields.append(parsed)
         else:
             constants.append(parsed)
-    names = [field.name for field in fields]
-    if twice := next((each for each in names if names.count(each) > 1), None):
+    (twice, times), *_ = Counter(field.name for field in fields).most_common(1) or [("", 0)]
+    if times > 1:
         raise MessageError(f"{name} has two fields {twice}")
     return MessageDefinition(name, tuple(fields), tuple(constants), text)
 
@@ -178,7 +184,7 @@ def _without_comment(line: str) -> str:
         if quote:
             quote = "" if char == quote and line[at - 1] != "\\" else quote
         elif char in "\"'":
-            quote = char if char in line[at + 1 :] else ""
+            quote = char if line.find(char, at + 1) > 0 else ""
         elif char == "#":
             return line[:at].strip()
     return line.strip()
@@ -220,25 +226,28 @@ def _field_type(text: str, package: str) -> FieldType:
 
 def md5(name: str, definitions: Definitions) -> str:
     """Return the md5 sum of a message of ROS 1, in hexadecimal. Raises MessageError if a nested type is missing."""
-    return _digest(_md5_text(name, definitions, ()))
+    return _digest(_md5_text(name, definitions, (), {}))
 
 
 def service_md5(request: str, response: str, definitions: Definitions) -> str:
     """Return the md5 sum of a service of ROS 1, by the names of its two parts."""
-    return _digest(_md5_text(request, definitions, ()) + _md5_text(response, definitions, ()))
+    known: dict[str, str] = {}
+    return _digest("".join(_md5_text(each, definitions, (), known) for each in (request, response)))
 
 
 def _digest(text: str) -> str:
     return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
 
 
-def _md5_text(name: str, definitions: Definitions, outer: tuple[str, ...]) -> str:
+def _md5_text(name: str, definitions: Definitions, outer: tuple[str, ...], known: dict[str, str]) -> str:
+    """Return what the sum of a type is made of. `known` are the sums of nested types, each of which is made once."""
     definition = find(name, definitions, outer)
     lines = [f"{each.type} {each.name}={each.value}" for each in definition.constants]
     for field in definition.fields:
-        kind = field.type
-        text = kind.text if kind.is_builtin else _digest(_md5_text(kind.base, definitions, (*outer, name)))
-        lines.append(f"{text} {field.name}")
+        base = field.type.base
+        if not field.type.is_builtin and base not in known:
+            known[base] = _digest(_md5_text(base, definitions, (*outer, name), known))
+        lines.append(f"{known.get(base, field.type.text)} {field.name}")
     return "\n".join(lines)
 
 

@@ -4,6 +4,7 @@ The classes have the fields, defaults and constants of their definitions. A boun
 the caller's, as r2p needs one for what varies.
 """
 
+import math
 import re
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -136,7 +137,11 @@ def _constant_value(constant: ConstantDefinition) -> str:
     if constant.type == "bool":
         return str(text.lower() in ("true", "1"))
     try:
-        return repr(float(text)) if constant.type in _FLOATS else text if int(text, 0) < 0 else text.lstrip("+")
+        if constant.type not in _FLOATS:
+            number = int(text, 0)
+            return text.lstrip("+") if text.isascii() else str(number)
+        real = float(text)
+        return repr(real) if math.isfinite(real) else f'float("{real}")'
     except ValueError:
         raise MessageError(f"{constant.type} {constant.name}={text}: that is not a value of this type") from None
 

@@ -285,11 +285,12 @@ def _read(files: list[Path], **given: Any) -> list[AppImage]:
 def _deployment(client: LoaderClient, apps: list[AppImage]) -> Iterator[Deployment]:
     """Load with a progress bar; when that is interrupted, say what it means for the module."""
     with _progress() as progress:
+        deployment = Deployment(client, apps, progress=progress, report=notify)
         try:
-            yield Deployment(client, apps, progress=progress, report=notify)
+            yield deployment
         except asyncio.CancelledError:
             names = ", ".join(each.name for each in apps)
-            notify(f"interrupted: {client.name} may lack {names}; the same command begins anew")
+            notify(f"interrupted: {client.name} may lack {names}{deployment.lost}. The same command begins anew")
             raise
 
 

@@ -268,6 +268,24 @@ async def test_what_was_removed_for_a_reload_is_named_when_that_fails() -> None:
         assert await names(loader) == ["one"]
 
 
+async def test_what_was_removed_is_named_when_the_load_can_not_be_begun_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    faults, emulation = emulated()
+    async with client(emulation) as (_, loader):
+        await add(loader, "one")
+
+        async def is_in_use(*, restart: bool) -> None:
+            raise LoaderError("PC2 uses the loader of IMU1 as well: end that first")
+
+        def refuse(name: str, done: int, total: int) -> None:
+            faults.refused.add(emulation.requests + 1)
+            monkeypatch.setattr(loader, "enter", is_in_use)
+
+        with pytest.raises(
+            LoaderError, match=r"^PC2 uses .*; its apps were removed, one with config 01.*\. Look at r2p"
+        ):
+            await Deployment(loader, [SmallApp("one")], progress=refuse).replace()
+
+
 async def test_a_listing_of_a_damaged_flash() -> None:
     async with client() as (power, loader):
         await add(loader, "one")

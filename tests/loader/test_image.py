@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import shutil
+import struct
 import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from elftools.elf.elffile import ELFFile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -80,6 +83,8 @@ def copy(tmp_path: Path) -> Any:
         for each in APPS.iterdir():
             shutil.copy(each, tmp_path)
         path = tmp_path / name
+        if not path.is_file():
+            return path
         beside = path.with_suffix(".toml")
         text = beside.read_text() if description is None else description
         for old, new in changes.items():
@@ -113,6 +118,9 @@ def copy(tmp_path: Path) -> Any:
         ("blink.elf", {"symbols": 'symbols = "lost.elf"'}, "can't read .*lost.elf: No such file"),
         ("blink.elf", {"stack": 'stack = 1024\nmain = "start"'}, "defines no function start"),
         ("blink.elf", {"stack": 'stack = 1024\nconfig = "cfg"'}, "does not define cfg"),
+        ("blink.elf", {"stack": "stack = " + "9" * 5000}, "blink.toml: Exceeds the limit"),
+        ("blink.elf", {"stack": "stack = " + "[" * 9000}, "blink.toml: maximum recursion depth exceeded"),
+        (".", {}, "can't read .*: Is a directory"),
         ("blink.c", {}, "blink.c is not an Intel HEX file"),
         ("lost.hex", {}, "can't read .*lost.hex: No such file"),
     ],
@@ -121,6 +129,45 @@ def test_files_that_are_refused(copy: Any, name: str, changes: dict[str, str], t
     path = copy(name, "" if name == "lost.hex" else None, **changes)
     with pytest.raises(AppFileError, match=text):
         read_app(path).link(addresses(read_app(path)))
+
+
+SECTION, SYMBOL = 40, 16
+"""Bytes of a section's header, and of a symbol."""
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "text"),
+    [
+        ("symbol app_main", b"\xff\xff", "defines no function app_main or main"),
+        ("symbol app_main", b"\x1e\0", "defines no function app_main or main"),  # in .comment, which is not loaded
+        ("target of .rel.rodata", b"\x1d\0\0\0", ".rel.rodata changes .bss, which has no content"),
+        ("size of .bss", b"\xff\xff\xff\xff", "its sections up to .bss have 429496.* bytes, more than any module has"),
+        ("compressed .text.near", struct.pack("<III", 1, 1 << 30, 4), ".text.near have 1073742110 bytes, more than"),
+    ],
+)
+def test_damaged_headers_of_elf_files(copy: Any, place: str, value: bytes, text: str) -> None:
+    path = copy("blink.elf")
+    content = bytearray(path.read_bytes())
+    for at, data in damage(ELFFile(io.BytesIO(content)), place, value).items():
+        content[at : at + len(data)] = data
+    path.write_bytes(content)
+    with pytest.raises(AppFileError, match=text):
+        read_app(path).link(addresses(read_app(path)))
+
+
+def damage(elf: Any, place: str, value: bytes) -> dict[int, bytes]:
+    """Return the bytes to be written, by their places in the file."""
+    what, _, name = place.partition(" ")
+    headers = {each.name: elf["e_shoff"] + SECTION * index for index, each in enumerate(elf.iter_sections())}
+    if what == "symbol":
+        table = elf.get_section_by_name(".symtab")
+        index = [each.name for each in table.iter_symbols()].index(name)
+        return {table["sh_offset"] + SYMBOL * index + 14: value}
+    if what == "compressed":
+        section = elf.get_section_by_name(name)
+        compressed = struct.pack("<I", section["sh_flags"] | 0x800)
+        return {headers[name] + 8: compressed, section["sh_offset"]: value}
+    return {headers[name.removeprefix("of ")] + {"target": 28, "size": 20}[what]: value}
 
 
 def test_an_option_replaces_what_the_description_says(copy: Any) -> None:

@@ -1,6 +1,9 @@
 """Messages whose lengths are those of the messages before them take the fast way, with the same result."""
 
+import random
 import struct
+import sys
+import threading
 from typing import Annotated
 
 import pytest
@@ -60,6 +63,32 @@ def test_a_message_of_a_known_size_with_other_counts_is_not_taken_for_a_known_on
         assert LAYOUT.decode(data) == one
     assert LAYOUT.decode(LAYOUT.encode(other)) == other
     assert LAYOUT.decode(data) == one
+
+
+def test_threads_that_decode_the_same_class_do_not_disturb_each_other() -> None:
+    scans = [LAYOUT.encode(KnownLengthScan("a" * size, 1.0, r2p.Array(), "", b"", good=True)) for size in range(40)]
+    errors: list[BaseException] = []
+
+    def decode(number: int) -> None:
+        chosen = random.Random(number)
+        try:
+            for _ in range(3000):
+                data = chosen.choice(scans)
+                assert [LAYOUT.encode(LAYOUT.decode(data)) for _ in range(3)] == [data] * 3
+        except BaseException as error:  # noqa: BLE001 - a thread's errors are lost
+            errors.append(error)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=decode, args=(number,)) for number in range(3)]
+        for each in threads:
+            each.start()
+        for each in threads:
+            each.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert not errors
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 9, 0xFFFFFFFF])

@@ -20,6 +20,7 @@ string NOTE=a # b
 float64 PI = 3.14
 bool OK = true
 int32 MASK=0x10
+float64 FAR=inf
 geometry_msgs/Pose pose
 string[] from   # where
 my_other_msgs/Joint[<=6] joints

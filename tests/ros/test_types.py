@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 import r2p
 from r2p.ros.classes import TIMES, RosTypes, definitions_of
 from r2p.ros.definitions import (
+    SEPARATOR,
+    TEXT_MAX,
     definition_text,
     md5,
     parse,
@@ -103,6 +105,7 @@ def test_a_class_becomes_a_definition_and_that_the_same_class(cls: type[r2p.Mess
         ("int32<=5 a", "only texts have a bound"),
         ("geometry_msgs/Point P=1", "a constant is"),
         ("int32 a\nint32 a", "two fields a"),
+        ("#" * (TEXT_MAX + 1), "has 1048577 characters, more than 1048576"),
         ("int32 a\n" + "=" * 80 + "\nnothing", "title of a nested type"),
     ],
 )
@@ -135,6 +138,29 @@ def test_types_that_contain_themselves_or_what_is_missing() -> None:
         TypeDescriptions(found).hash("a_msgs/A")
     with pytest.raises(r2p.MessageError, match="a_msgs/B is missing, which is in a_msgs/A"):
         RosTypes(1, parse("a_msgs/A", "B b")).load("a_msgs/A")
+
+
+def tower(levels: int, line: str) -> str:
+    """Each type holds the next one as `line` says, with `{}` for its name."""
+    texts = [line.format(f"T{level + 1}") + f"\n{SEPARATOR}\nMSG: a_msgs/T{level + 1}\n" for level in range(levels)]
+    return "".join(texts) + "int8 x\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        (tower(400, "{} x"), "a_msgs/T0 has more than 32 types in one another, down to a_msgs/T33"),
+        (tower(30, "{0} x\n{0} y"), "a_msgs/T17 has 8192 fields with all types in it, more than 4096"),
+        (tower(3, "{}[999] x"), "a_msgs/T0 has 997002999 values"),
+        ("float64[999999999] x", "a_msgs/T0 has 999999999 values"),
+        ("uint8 class\nuint8 class_", "a_msgs/T0: a class can't have both fields class and class_"),
+    ],
+)
+def test_definitions_that_blow_up_are_refused(text: str, error: str) -> None:
+    found = parse("a_msgs/T0", text)
+    assert len(md5("a_msgs/T0", found)) == 32  # of as many types as there are, not of as many fields
+    with pytest.raises(r2p.MessageError, match=error):
+        RosTypes(1, found).load("a_msgs/T0")
 
 
 @pytest.mark.parametrize("name", ["", "Imu", "a/b/c", "a/msg/", "sensor_msgs/Imu/", "1a/B", "a/msg/srv/B"])

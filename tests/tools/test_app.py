@@ -141,6 +141,21 @@ async def test_the_others_are_loaded_again(capsys: pytest.CaptureFixture[str]) -
     assert printed(capsys)[-1]["stack"] == 2048
 
 
+async def test_what_is_lost_by_ctrl_c_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    async with opened() as (power, session):
+        await load(session, "IMU1", [BLINK])
+        loader = power.module.loader
+        loading = asyncio.create_task(load(session, "IMU1", [BLINK], reload=True))
+        while list(loader.apps):  # noqa: ASYNC110 - the emulation has no event for it
+            await asyncio.sleep(0.005)
+        loading.cancel()
+        await asyncio.wait([loading])
+    assert (
+        "interrupted: IMU1 may lack blink; its apps were removed, blink with config f4010000fdffffff626c696e6b"
+        f"{'00' * 11}. The same command begins anew"
+    ) in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("files", "given", "text"),
     [
