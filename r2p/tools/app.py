@@ -192,7 +192,7 @@ async def run(session: Session, module: Name, names: AppNames, *, timeout: Answe
         await _reboot(session, client)
         started = asyncio.get_running_loop().time()
         with session.waiting(f"a sign of life of {module}"):
-            alive = await wait_until(lambda: _heard_at(client) > started + _APPS_START, _SHOWS_LIFE)
+            alive = await wait_until(lambda: _heard_at(session, client) > started + _APPS_START, _SHOWS_LIFE)
     if alive:
         notify(f"{module} runs with {', '.join(names)}")
     else:
@@ -203,9 +203,19 @@ async def run(session: Session, module: Name, names: AppNames, *, timeout: Answe
         )
 
 
-def _heard_at(client: LoaderClient) -> float:
+def _heard_at(session: Session, client: LoaderClient) -> float:
+    """Return when the module was last heard of; the topics of a link are its own, where no other module is."""
     view = client.view()
-    return 0.0 if view is None else asyncio.get_running_loop().time() - view.age
+    if view is None:
+        return 0.0
+    ages = [view.age]
+    network = session.module.network
+    if [each.link for each in network.modules()].count(view.link) == 1:
+        topics = [
+            each for each in network.topics().values() if {*each.published_on, *each.subscribed_on} == {view.link}
+        ]
+        ages += [each.age for each in topics if each.age is not None]
+    return asyncio.get_running_loop().time() - min(ages)
 
 
 # The client

@@ -7,6 +7,7 @@ and the serial port by those of an emulated module.
 import contextlib
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -103,9 +104,9 @@ class Session:
                 process.finish(int(block.notes.get("exits", 0)), pattern(command.shown))
 
     def _replaced(self, text: str) -> str:
-        for shown, real in self._replacements.items():
-            text = text.replace(shown, real)
-        return text
+        """All at once: what one replacement has put in is not searched for the next one."""
+        shown = "|".join(map(re.escape, self._replacements))
+        return re.sub(rf"(?<![0-9])(?:{shown})(?![0-9])", lambda found: self._replacements[found[0]], text)
 
 
 def _blocks(page: Path) -> list[Block]:

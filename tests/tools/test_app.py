@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
-from r2p.sim.modules import EmulatedLoader, LoaderFaults, MemoryMap, Powered
+from r2p.msg import Led
+from r2p.sim.modules import EmulatedLoader, FirmwareModule, LoaderFaults, MemoryMap, Powered, Subscribes
 from r2p.tools.app import disable, enable, info, list_, load, remove, run
 from r2p.tools.session import Session, Settings, TimedOut, UsageError
 from tests.loader.rig import board
@@ -66,6 +67,19 @@ async def test_from_a_file_to_a_running_app(capsys: pytest.CaptureFixture[str]) 
             "config": 24,
         }
         assert power.module.flags == 2
+
+
+async def test_an_announced_topic_is_a_sign_of_life(capsys: pytest.CaptureFixture[str]) -> None:
+    """On a line of its own: with many topics, the next ALIVE of firmware comes seconds later."""
+    imu = FirmwareModule("IMU1", subscribers=[Subscribes(f"topic{number}", Led) for number in range(7)])
+    async with Powered(imu) as power, r2p.Module("_tool01", via=power.wire(), observer=True, watchdog=False) as module:
+        session = Session(module, Settings(via=["wire:IMU1"]))
+        await load(session, "IMU1", [BLINK])
+        loop = asyncio.get_running_loop()
+        before = loop.time()
+        await run(session, "IMU1", ["blink"])
+        assert loop.time() - before < 3.0
+    assert "IMU1 runs with blink" in capsys.readouterr().err
 
 
 async def test_messages_to_the_user(capsys: pytest.CaptureFixture[str]) -> None:

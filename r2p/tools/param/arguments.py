@@ -103,8 +103,8 @@ MaybeTarget = Annotated[
         help="Or NODE, MODULE, or one parameter: MODULE/NODE.NAME; default: all modules.",
     ),
 ]
-ModuleName = Annotated[
-    str, typer.Argument(metavar="MODULE", autocompletion=complete_module_with_parameters, show_default=False)
+ModuleNames = Annotated[
+    list[str], typer.Argument(metavar="MODULE", autocompletion=complete_module_with_parameters, show_default=False)
 ]
 Names = Annotated[
     list[str] | None,

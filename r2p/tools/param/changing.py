@@ -17,7 +17,7 @@ from r2p.tools.module import unknown_module
 from r2p.tools.options import Format
 from r2p.tools.output import Output, notify
 from r2p.tools.param import firmware as on_firmware
-from r2p.tools.param.arguments import Assignments, MaybeTarget, ModuleName, Names, Target
+from r2p.tools.param.arguments import Assignments, MaybeTarget, ModuleNames, Names, Target
 from r2p.tools.param.firmware import App, As, Raw, Reboot
 from r2p.tools.param.targets import Infos, find, find_modules, one_module, references, similar, with_name
 from r2p.tools.param.texts import assignment, brief, plain, put_all, shown
@@ -106,20 +106,28 @@ async def reset(session: Session, target: Target, names: Names = None) -> None:
     notify(f"{module}: {count} parameter{'' if count == 1 else 's'} reset; the file of the module changes with save")
 
 
-async def save(session: Session, module: ModuleName) -> None:
-    """Have a module save what was set.
+async def save(session: Session, modules: ModuleNames) -> None:
+    """Have modules save what was set.
 
-    It writes to the file that it was started with (`r2p run --params-file`), for its next start.
+    Each writes to the file that it was started with (`r2p run --params-file`), for its next start.
     """
+    for module in modules:
+        await _check_module(session, module)
+    for module in modules:
+        with _answered(session, module):
+            await session.module.network.save_parameters(module)
+        notify(f"{module}: parameters saved")
+
+
+async def _check_module(session: Session, module: str) -> None:
+    """Raise UsageError for a node, TimedOut for a module that is not there, before any module saves."""
     modules = await find_modules(session, module)
-    if module not in modules:
-        begun = [each for each in modules if module.startswith(f"{each}/")]
-        if begun:
-            raise UsageError(f"a module saves all of its parameters: write r2p param save {begun[0]}")
-        raise TimedOut(unknown_module(session, module))
-    with _answered(session, module):
-        await session.module.network.save_parameters(module)
-    notify(f"{module}: parameters saved")
+    if module in modules:
+        return
+    begun = [each for each in modules if module.startswith(f"{each}/")]
+    if begun:
+        raise UsageError(f"a module saves all of its parameters: write r2p param save {begun[0]}")
+    raise TimedOut(unknown_module(session, module))
 
 
 # What is to be set

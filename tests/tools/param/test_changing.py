@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import tomllib
 from pathlib import Path
@@ -103,7 +104,7 @@ async def test_save_and_reset(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         module.start(drive)
         async with tool() as session:
             await set_(session, "BOT/drive", ["kp=0.7", "top=2"])
-            await save(session, "BOT")
+            await save(session, ["BOT"])
             assert tomllib.loads(path.read_text())["params"] == {"BOT": {"drive": {"kp": 0.7, "top": 2.0}}}
             await reset(session, "BOT/drive", ["kp"])
             assert module.parameters["drive", "kp"].value == 0.5
@@ -112,8 +113,29 @@ async def test_save_and_reset(tmp_path: Path, capsys: pytest.CaptureFixture[str]
             with pytest.raises(r2p.ParameterError, match="read-only"):
                 await reset(session, "BOT/drive", ["serial"])
             with pytest.raises(UsageError, match="a module saves all of its parameters: write r2p param save BOT"):
-                await save(session, "BOT/drive")
+                await save(session, ["BOT/drive"])
     assert "BOT: parameters saved" in capsys.readouterr().err
+
+
+async def test_several_modules_save_or_none_if_one_is_not_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {name: tmp_path / f"{name}.toml" for name in ("BOT", "ARM")}
+    async with contextlib.AsyncExitStack() as stack:
+        for name, path in files.items():
+            module = await stack.enter_async_context(r2p.Module(name, via=["memory:lab"], params_file=path))
+            module.start(drive)
+        session = await stack.enter_async_context(tool())
+        for name in files:
+            await set_(session, f"{name}/drive", ["kp=0.7"])
+        with pytest.raises(TimedOut, match="there is no module ARMM"):
+            await save(session, ["BOT", "ARMM"])
+        assert not any(path.exists() for path in files.values())
+        await save(session, ["BOT", "ARM"])
+    assert [tomllib.loads(path.read_text())["params"][name] for name, path in files.items()] == [
+        {"drive": {"kp": 0.7}}
+    ] * 2
+    assert capsys.readouterr().err.endswith("r2p: BOT: parameters saved\nr2p: ARM: parameters saved\n")
 
 
 async def test_a_module_without_a_file_says_what_to_do() -> None:
@@ -121,9 +143,9 @@ async def test_a_module_without_a_file_says_what_to_do() -> None:
         with pytest.raises(
             r2p.ParameterError, match="BOT has no file for parameters: start it with `r2p run --params-"
         ):
-            await save(session, "BOT")
+            await save(session, ["BOT"])
         with pytest.raises(TimedOut, match=r"there is no module BOTT on memory:lab; .* did you mean BOT\?"):
-            await save(session, "BOTT")
+            await save(session, ["BOTT"])
 
 
 GAINS = """

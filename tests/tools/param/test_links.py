@@ -36,7 +36,7 @@ async def test_through_two_gateways_and_a_bus(capsys: pytest.CaptureFixture[str]
         with pytest.raises(r2p.ParameterError, match=r"BOT/drive\.kp = 11\.0: it takes 10\.0"):
             await set_(session, "BOT/drive", ["kp=11"])
         with pytest.raises(r2p.Error, match="BOT has no file for parameters"):
-            await save(session, "BOT")
+            await save(session, ["BOT"])
         capsys.readouterr()
         await dump(session, "BOT")
         path.write_text(capsys.readouterr().out)
