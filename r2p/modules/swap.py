@@ -121,8 +121,14 @@ class NodeSwap:
         return {self.old.node.name, self.new.node.name}
 
     def interrupt(self, reason: str) -> None:
-        """Note that the module ends both nodes."""
+        """Note that the module ends both nodes; the new one is cancelled afterwards.
+
+        An old node that is handing over may have left its motors running. Then the new one takes over at once, as what
+        its clean-up publishes is to stop them.
+        """
         self.interrupted = reason
+        if self.old.node.handing_over:
+            self.old.node.close()
         self._woken.set()
 
     async def run(self) -> SwapResult | Error:
@@ -246,7 +252,7 @@ class NodeSwap:
     async def _end_old(self) -> bool:
         """End the old node; return False if its clean-up hangs: then its publishers are closed all the same."""
         self._replaced.publishers = [each for each in self.old.node.publishers if each.hand_over is None]
-        self.old.node.handing_over = True
+        self.old.node.handing_over = not self.interrupted
         task = self.old.cancel()
         if task is None:
             return True

@@ -436,6 +436,41 @@ async def test_the_end_of_the_module_ends_a_swap(after: float) -> None:
         assert str(swap.exception()) == "the swap of node motor of module PC1 was interrupted: the module was closed"
 
 
+@pytest.mark.parametrize("klass", [r2p.NonRealTime(), r2p.Sporadic(0.1)])
+@pytest.mark.parametrize("after", [0.03, 0.3, 0.7])
+async def test_a_stop_in_the_middle_of_a_swap_stops_the_motors(klass: Any, after: float) -> None:
+    """At 0.3 s the old node, which hands over, cleans up, and what the new one publishes is held back."""
+
+    def motor(duty: int, cleanup: float) -> r2p.NodeFunction:
+        async def run(node: r2p.Node) -> None:
+            duties: Any = node.advertise("duty", Led, klass)
+            await duties.wait_subscriber()
+            duties.publish_nowait(led(duty))
+            try:
+                await hold(node)
+            finally:
+                if not node.handing_over:
+                    duties.publish_nowait(led(0))
+                await asyncio.sleep(cleanup)
+
+        return run
+
+    async with r2p.Module("A", via="memory:a") as host, r2p.Module("B", via="memory:a") as far, node_in(far) as test:
+        got: list[Led] = []
+        reading = asyncio.create_task(collect(test.subscribe("duty", Led), got))
+        host.start(motor(1, 0.5), name="motor")
+        await asyncio.sleep(0.5)
+        swap = asyncio.create_task(host.swap("motor", motor(2, 0.0)))
+        await asyncio.sleep(after)
+        assert numbers(got)[-1] == (1 if after < 0.5 else 2)
+        await host.stop()
+        await asyncio.wait([swap])
+        assert (swap.exception() is None) is (after > 0.5)
+        await asyncio.sleep(0.1)
+        assert numbers(got)[-1] == 0
+        reading.cancel()
+
+
 async def test_a_node_swaps_itself_and_two_swaps_do_not_meet() -> None:
     async def old(node: r2p.Node) -> None:
         node.advertise("leds", Led)
