@@ -3,7 +3,6 @@
 The other side is `r2p.modules.node_control`.
 """
 
-import math
 import zlib
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Protocol, TypeVar
 
 import msgspec
 
+from r2p.clock import SHORTEST
 from r2p.codecs.own_services import Operation
 from r2p.errors import DecodeError, Error
 from r2p.messages import Message
@@ -37,6 +37,7 @@ from r2p.runtime.sample import PublisherClass
 
 M = TypeVar("M", bound=Message)
 
+_LONGEST = 1e9  # seconds of a pause, or of a period
 _FIRMWARE = "its nodes are compiled into it (`r2p app` loads others)"
 
 
@@ -185,8 +186,9 @@ def _compressed(code: Path) -> bytes:
 
 def _pause(entry: TopicPauseEntry) -> TopicPause:
     publisher_class = PublisherClass(entry.publisher_class & 3 or 1)  # a byte from outside
-    return TopicPause(entry.topic, publisher_class, _number(entry.pause), _number(entry.period))
+    return TopicPause(entry.topic, publisher_class, _seconds(entry.pause, 0.0), _seconds(entry.period, SHORTEST))
 
 
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value
+def _seconds(value: float, least: float) -> float | None:
+    """Return a time from outside; None if there is none, or it can't be one."""
+    return value if least <= value <= _LONGEST else None

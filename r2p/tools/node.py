@@ -59,8 +59,8 @@ def _state(found: r2p.NodeList | None, node: str, *, for_people: bool) -> dict[s
     known = next((each for each in found.nodes if each.node == node), None) if found is not None else None
     if found is None or known is None:
         return dict.fromkeys(("state", "restarts", "age", "cpu"), "" if for_people else None)
-    age = None if math.isnan(known.age) else round(known.age, 1)
-    cpu = None if math.isnan(found.cpu) else round(100 * found.cpu, 1)
+    age = round(known.age, 1) if math.isfinite(known.age) else None
+    cpu = round(100 * found.cpu, 1) if math.isfinite(found.cpu) else None
     state = "running" if known.running else "crashed" if known.error else "ended"
     if not for_people:
         return {"state": state, "restarts": known.restarts, "age": age, "cpu": cpu}

@@ -29,9 +29,12 @@ from r2p.modules.node_messages import (
     CodePiece,
     NodeAction,
     NodeCommand,
+    NodeOutcome,
+    TopicPauseEntry,
     decode_argument,
     decode_content,
     encode_argument,
+    encode_content,
 )
 from r2p.msg import Led, Log
 from r2p.testing.network import node_in
@@ -435,6 +438,19 @@ async def test_hostile_arguments_are_errors(data: bytes, operation: int) -> None
                 await bot._opened.own_services.change(bot.instance, Operation(operation), each)
             except (r2p.Error, LookupError, ValueError):
                 continue
+
+
+@virtual_time
+async def test_times_that_can_not_be_are_none() -> None:
+    times = [(0.1, 0.1), (0.0, 0.0), (math.inf, 1.0), (1e300, 1e-300), (-1.0, -1.0), (math.nan, math.nan)]
+    topics = tuple(TopicPauseEntry(topic="leds", publisher_class=1, pause=a, period=b) for a, b in times)
+
+    async def ask(module: str, operation: Operation, argument: bytes = b"", *, what: str, firmware: str) -> bytes:
+        return encode_content(NodeOutcome(node="blink", topics=topics))
+
+    result = await r2p.RemoteNodes(ask, "BOT").swap("blink", "blink.py", "blink")
+    found = [(each.pause, each.period) for each in result.topics]
+    assert found == [(0.1, 0.1), (0.0, None), (None, 1.0), (None, None), (None, None), (None, None)]
 
 
 def test_arguments_fit_one_message() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import sys
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
+from r2p.modules.node_control import NodeControl
+from r2p.modules.node_messages import NodeInfo, NodeList
 from r2p.tools import node_control
 from r2p.tools.log import Level, log
 from r2p.tools.node import info, list_
@@ -129,6 +132,18 @@ async def test_a_crash_is_listed_with_its_error(directory: Path, capsys: pytest.
         assert broken["function"] == "robot_nodes.py:broken"
         with pytest.raises(r2p.NodeCrashed):
             await module.__aexit__(None, None, None)
+
+
+@virtual_time
+async def test_a_module_that_says_what_can_not_be_is_listed(
+    directory: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = NodeInfo(node="blink", running=True, age=math.inf)
+    monkeypatch.setattr(NodeControl, "list", lambda _self: NodeList(cpu=-math.inf, nodes=(wrong,)))
+    async with bot(directory), tool() as session:
+        await list_(session)
+        row = next(each for each in printed(capsys) if each["node"] == "BOT/blink")
+        assert (row["state"], row["age"], row["cpu"]) == ("running", None, None)
 
 
 @virtual_time
