@@ -436,8 +436,9 @@ class Module:
         if self._unused_alarm is not None:
             self._unused_alarm.close()
             self._unused_alarm = None
-            if unused := self.parameters.unused():
-                logger.warning("no node of %s has declared the parameter %s", self.name, ", ".join(unused))
+            for unused in self.parameters.unused():
+                hint = self.parameters.similar(unused)
+                logger.warning("no node of %s has declared the parameter %s%s", self.name, unused, hint)
 
     @property
     def _held(self) -> bool:

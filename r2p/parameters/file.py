@@ -24,9 +24,12 @@ from typing import Any, TypeVar
 
 from r2p.codecs.parameters import Name, Plain
 from r2p.errors import ParameterError
+from r2p.log_lines import get_logger
 from r2p.parameters.sources import TABLE, flatten, read_tables, read_toml
 
 T = TypeVar("T")
+
+logger = get_logger("r2p.module")
 
 FORMAT = 1
 """The number of the format, which the file begins with."""
@@ -49,8 +52,13 @@ class ParameterFile:
         """The file; a symbolic link stays one, and what it points to is replaced."""
 
     async def load(self, module: str) -> dict[Name, object]:
-        """Return what is saved for a module; nothing if there is no file yet. Raises ParameterError."""
+        """Return what is saved for a module; nothing if there is no file yet. Raises ParameterError.
+
+        Warns if nothing can be saved.
+        """
         try:
+            if not await _in_thread(self._is_writable):
+                logger.warning("module %s can't save parameters: %s is read-only", module, self.path.parent)
             return await _in_thread(lambda: self._load(module))
         except OSError as error:
             raise ParameterError(f"can't read parameters from {self.path}: {error.strerror or error}") from error
@@ -66,8 +74,17 @@ class ParameterFile:
             except BlockingIOError:
                 await asyncio.sleep(_LOCK_PAUSE)
             except OSError as error:
-                raise ParameterError(f"can't save parameters to {self.path}: {error.strerror or error}") from error
-        raise ParameterError(f"can't save parameters to {self.path}: another process holds the lock of its directory")
+                raise ParameterError(
+                    f"{module} can't save parameters to {self.path}: {error.strerror or error}"
+                ) from error
+        raise ParameterError(
+            f"{module} can't save parameters to {self.path}: another process holds the lock of its directory"
+        )
+
+    def _is_writable(self) -> bool:
+        """Return whether the directory allows a new file; True if there is none, which is an error of its own."""
+        directory = Path(os.path.realpath(self.path)).parent
+        return not directory.is_dir() or os.access(directory, os.W_OK | os.X_OK)
 
     def _load(self, module: str) -> dict[Name, object]:
         if not self.path.exists():
@@ -81,10 +98,14 @@ class ParameterFile:
         contents = read_toml(self.path)
         number = contents.get("format")
         if number != FORMAT or isinstance(number, bool):
-            known = f"format {number!r}" if "format" in contents else "no format number"
+            if "format" not in contents:
+                raise ParameterError(
+                    f"{self.path} has no format number, so it was not saved by r2p: write `format = {FORMAT}` at its "
+                    "beginning, or give it with --params, which only reads it"
+                )
             raise ParameterError(
-                f"{self.path} has {known}, this version of r2p writes `format = {FORMAT}`: update r2p, or name another "
-                "file"
+                f"{self.path} has format {number!r}, this version of r2p writes `format = {FORMAT}`: update r2p, or "
+                "name another file"
             )
         return contents
 

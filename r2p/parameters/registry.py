@@ -134,6 +134,12 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
         """Return what options and files name that no node has declared, each with its source."""
         return [f"{key} ({source.label})" for source in self._sources for key in source.unused()]
 
+    def similar(self, unused: str) -> str:
+        """Return the end of a message about a text of `unused`: the parameter with the most similar name, if any."""
+        known = [text for node, name in self._parameters for text in (f"{node}.{name}", name)]
+        close = difflib.get_close_matches(unused.partition(" ")[0], known, n=1)
+        return f"; did you mean {close[0]}?" if close else ""
+
     # Reading
 
     def infos(self, node: str | None = None) -> list[ParameterInfo]:

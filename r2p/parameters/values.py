@@ -88,9 +88,9 @@ def parse(kind: ParameterKind, text: str) -> object:
         case ParameterKind.FLOAT:
             return _parse_float(text)
         case ParameterKind.INTS:
-            return tuple(_parse_int(each) for each in _elements(text))
+            return _parse_elements(_parse_int, text, "ints, such as 1,2")
         case ParameterKind.FLOATS:
-            return tuple(_parse_float(each) for each in _elements(text))
+            return _parse_elements(_parse_float, text, "floats, such as 0.5,2")
     return text
 
 
@@ -207,6 +207,13 @@ def _parse_float(text: str) -> float:
         return float(text)
     except ValueError:
         raise ParameterError("it takes a float") from None
+
+
+def _parse_elements(parse_one: Callable[[str], object], text: str, what: str) -> tuple[object, ...]:
+    try:
+        return tuple(parse_one(each) for each in _elements(text))
+    except ParameterError:
+        raise ParameterError(f"it takes {what}") from None
 
 
 def _elements(text: str) -> list[str]:

@@ -202,6 +202,8 @@ def parameter_sources(
     of_all: list[str] = []
     for option in options:
         module, found, rest = option.partition("/")
+        if not found and option.partition(".")[0] in of_modules:
+            raise UsageError(f"--param {option}: write it as {option.replace('.', '/', 1)}")
         if not found or "=" in module:
             of_all.append(option)
         elif module in of_modules:
@@ -244,7 +246,8 @@ def _check_parameters(robot: Triskar2) -> None:
         for each in board.parameters.unused():
             unused.setdefault(each, []).append(board.name)
     for name, modules in unused.items():
-        raise UsageError(f"no node of {modules[0] if len(modules) == 1 else 'the robot'} has a parameter {name}")
+        hint = next(filter(None, (robot.modules[each].parameters.similar(name) for each in modules)), "")
+        raise UsageError(f"no node of {modules[0] if len(modules) == 1 else 'the robot'} has a parameter {name}{hint}")
 
 
 async def _watch(node: r2p.Node, reader: FiguresReader) -> None:

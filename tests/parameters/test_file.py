@@ -141,7 +141,7 @@ async def test_reads_the_file_again_on_a_reboot_and_keeps_its_values_if_it_is_br
     ("text", "reason"),
     [
         ("format = 2\n", "format 2, this version of r2p writes `format = 1`"),
-        ("[params.PC1.speed]\nkp = 1\n", "no format number"),
+        ("[params.PC1.speed]\nkp = 1\n", "no format number.*: write `format = 1` at its beginning, or .* --params"),
         ("format = 1\n[params.PC1.speed\n", "params.toml: "),
         ("format = 1\n[params.PC1]\nspeed = 3\n", r"write a table \[params.PC1.node\]"),
         ("format = 1\nparams = 3\n", "write a table"),
@@ -220,10 +220,18 @@ async def test_an_error_of_the_disk_is_told_and_a_later_save_writes_all(
         node.parameter("kp", 0.5).set(0.7)
         with monkeypatch.context() as patched:
             patched.setattr(os, "fsync", full)
-            with pytest.raises(r2p.ParameterError, match=r"can't save parameters to .*: No space left on device"):
+            with pytest.raises(r2p.ParameterError, match=r"PC1 can't save parameters to .*: No space left on device"):
                 await module.parameters.save()
         assert not path.exists()
         assert await module.parameters.save() == 1
+
+
+async def test_a_read_only_directory_is_reported_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, _mode: path != tmp_path)
+    async with r2p.Module("PC1", params_file=tmp_path / "params.toml"):
+        assert f"module PC1 can't save parameters: {tmp_path} is read-only" in caplog.text
 
 
 async def test_links_owner_and_permissions_stay(tmp_path: Path) -> None:

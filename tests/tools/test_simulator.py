@@ -332,7 +332,8 @@ def test_parameters_come_from_files_and_options(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["--param", "motor.kq=1"], "no node of the robot has a parameter motor.kq (--param)"),
+        (["--param", "motor.kq=1"], "parameter motor.kq (--param); did you mean motor.kp?"),
+        (["--param", "MOTOR1.motor.kp=1"], "write it as MOTOR1/motor.kp=1"),
         (["--param", "PS/motor.kp=1"], "no node of PS has a parameter motor.kp (--param)"),
         (["--param", "motor.kp=-1"], "it takes 0.0 V/(rad/s) or more (from --param)"),
         (["--param", "MOTR1/motor.kp=1"], "the robot has no module MOTR1; did you mean MOTOR1?"),

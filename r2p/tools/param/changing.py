@@ -19,7 +19,7 @@ from r2p.tools.output import Output, notify
 from r2p.tools.param import firmware as on_firmware
 from r2p.tools.param.arguments import Assignments, MaybeTarget, ModuleNames, Names, Target
 from r2p.tools.param.firmware import App, As, Raw, Reboot
-from r2p.tools.param.targets import Infos, find, find_modules, one_module, references, similar, with_name
+from r2p.tools.param.targets import Infos, find, find_modules, of_name, one_module, references, similar, with_name
 from r2p.tools.param.texts import assignment, brief, plain, put_all, shown
 from r2p.tools.session import Session, TimedOut, UsageError
 
@@ -157,7 +157,7 @@ def _values(infos: Infos, reference: str, pairs: list[tuple[str, str]]) -> list[
     """Return the parameters with the values that the texts stand for. Raises ParameterError for one that is none."""
     values: dict[str, Value] = {}
     for name, text in pairs:
-        chosen = [info for info in infos if name in ("", info.name)]
+        chosen = of_name(infos, name) if name else infos
         if not name and len(infos) > 1:
             raise UsageError(f"{reference} has several parameters, and {text} is one value: {_HOW}")
         if not chosen:

@@ -87,6 +87,11 @@ def references(module: str, node: str, name: str) -> tuple[str, ...]:
     return module, path, f"{path}.{name}", f"{path}/{name}", node, f"{node}.{name}"
 
 
+def of_name(infos: Infos, name: str) -> Infos:
+    """Return the parameters of this name, else those that `NODE.NAME` means."""
+    return [info for info in infos if name == info.name] or [i for i in infos if name == f"{i.node}.{i.name}"]
+
+
 def one_module(infos: Infos, target: str) -> str:
     """Return the module of these parameters. Raises UsageError if they are of several."""
     modules = list(dict.fromkeys(info.module for info in infos))
@@ -151,7 +156,7 @@ def _named(infos: Infos, names: list[str], target: str) -> Infos:
     """Return the parameters of these names, in this order; all without names. Raises r2p.Error for an unknown one."""
     found: Infos = []
     for name in names:
-        chosen = [info for info in infos if name == info.name]
+        chosen = of_name(infos, name)
         if not chosen:
             raise r2p.Error(f"{target} has no parameter {name}{similar(name, (i.name for i in infos), 'it has')}")
         found += chosen

@@ -26,6 +26,7 @@ pytestmark = pytest.mark.virtual_time
         ["BOT/drive", "kp=0.7", "mode=FAST"],
         ["drive", "kp=7e-1", "mode=FAST"],
         ["BOT", "mode=FAST", "kp=0.7"],
+        ["BOT", "drive.mode=FAST", "drive.kp=0.7"],
     ],
 )
 async def test_set_several(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
