@@ -67,7 +67,7 @@ def _check_ram(apps: Sequence[AppImage], listing: AppListing, module: str) -> No
     for app in apps:
         if app.stack > size:
             raise LoaderError(f"{app.path}: a stack of {app.stack} bytes is more than {module} has RAM ({size} bytes)")
-    needed = sum(_up(app.bss_size, RAM_GRAINS[0]) + _up(app.data_size, RAM_GRAINS[0]) for app in apps)
+    needed = sum(rounded(app.bss_size, RAM_GRAINS[0]) + rounded(app.data_size, RAM_GRAINS[0]) for app in apps)
     if needed > size:
         raise LoaderError(f"no room in the RAM of {module}: {needed} bytes are needed, it has {size} for apps")
     wrong: LayoutError | None = None
@@ -131,8 +131,8 @@ def expected_addresses(apps: Sequence[AppImage], memory: AppinfoSummary, grain: 
     for app in apps:
         program = flash + ENTRY_SIZE
         after = program + rounded(app.program_size)
-        bss = ram - _up(app.bss_size, grain)
-        ram = bss - _up(app.data_size, grain)
+        bss = ram - rounded(app.bss_size, grain)
+        ram = bss - rounded(app.data_size, grain)
         flash += app.flash
         yield LinkingAddresses(
             infoadr=flash - app.flash,
@@ -151,7 +151,3 @@ def _ram(app: AppImage, addresses: LinkingAddresses) -> list[range]:
 
 def _overlap(one: range, other: range) -> bool:
     return one.start < other.stop and other.start < one.stop
-
-
-def _up(length: int, grain: int) -> int:
-    return -(-length // grain) * grain

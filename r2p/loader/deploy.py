@@ -150,6 +150,7 @@ class Deployment:
             await self._client.enter(restart=True)
             ours = {app.name for app in self._apps}
             while (apps := (await self._client.list_apps()).apps) and apps[-1].name in ours:
+                self._loaded = [each for each in self._loaded if each.app.name != apps[-1].name]
                 await remove_last(self._client, apps[-1].name)
         except LoaderError as error:
             raise self._failure(error) from fault

@@ -20,6 +20,7 @@ from r2p.loader.image import (
     LinkedApp,
     check_outcome,
     padded,
+    rounded,
 )
 from r2p.loader.relocations import relocate
 
@@ -231,7 +232,7 @@ def _lay_out(content: ElfContent, part: Part) -> int:
     """Give the sections of a part their places; return its length."""
     end = 0
     for each in content.of(part):
-        each.offset = _aligned(end, each.align)
+        each.offset = rounded(end, each.align)
         end = each.offset + each.size
     return end
 
@@ -241,13 +242,9 @@ def _lay_out_commons(content: ElfContent, end: int) -> tuple[dict[str, int], int
     places: dict[str, int] = {}
     for each in content.symbols:
         if each.section == "SHN_COMMON":
-            places[each.name] = _aligned(end, max(1, each.value))  # the value of one is its alignment
+            places[each.name] = rounded(end, max(1, each.value))  # the value of one is its alignment
             end = places[each.name] + each.size
     return places, end
-
-
-def _aligned(offset: int, align: int) -> int:
-    return -(-offset // align) * align
 
 
 def _image(content: ElfContent, part: Part) -> bytearray:

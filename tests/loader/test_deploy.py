@@ -286,6 +286,27 @@ async def test_what_was_removed_is_named_when_the_load_can_not_be_begun_again(mo
             await Deployment(loader, [SmallApp("one")], progress=refuse).replace()
 
 
+async def test_what_was_loaded_again_and_then_removed_for_another_try_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    faults, emulation = emulated()
+    async with client(emulation) as (power, loader):
+        await add(loader, "one", "two")
+        remove_last = loader.remove_last
+
+        async def remove_and_cut() -> None:
+            await remove_last()
+            power.module.fault = "no power"
+
+        def refuse(name: str, done: int, total: int) -> None:
+            if name == "two":
+                faults.refused.add(emulation.requests + 1)
+                monkeypatch.setattr(loader, "remove_last", remove_and_cut)
+
+        with pytest.raises(
+            LoaderSilent, match=r"without one, two; its apps were removed, one with config 01.*, two with"
+        ):
+            await Deployment(loader, [SmallApp("one"), SmallApp("two")], progress=refuse).replace()
+
+
 async def test_a_listing_of_a_damaged_flash() -> None:
     async with client() as (power, loader):
         await add(loader, "one")
