@@ -188,10 +188,10 @@ class NetworkView:
     async def set_parameters(self, module: str, values: Mapping[tuple[str, str], object]) -> None:
         """Set parameters of a module, one or several, by (node, name): all or nothing.
 
-        An int converts to a float, and the name of a member to an enum. Raises ParameterError with the reason of the
-        module that refuses the values or any change: then nothing has changed. Raises Error if there is no such module,
-        it can't answer, or it has restarted meanwhile; and TimeoutError if it does not answer, and whether it has set
-        them is unknown.
+        An int converts to a float, the name of a member to an enum, and None stands for the value of the start, as
+        `reset_parameters` says. Raises ParameterError with the reason of the module that refuses the values or any
+        change: then nothing has changed. Raises Error if there is no such module, it can't answer, or it has restarted
+        meanwhile; and TimeoutError if it does not answer, and whether it has set them is unknown.
         """
         with self._explains_restarts(module):
             await parameter_services.change(self._asker(module), module, values)

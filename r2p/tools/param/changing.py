@@ -92,17 +92,14 @@ async def reset(session: Session, target: Target, names: Names = None) -> None:
     """
     infos = await find(session, target, names or [])
     module, network = one_module(infos, target), session.module.network
-    chosen: dict[str, list[str]] = {}
-    for info in infos:
-        if not info.read_only or names or len(infos) == 1:  # those that are named are left to the module to refuse
-            chosen.setdefault(info.node, []).append(info.name)
+    # Those that are read-only and named are left to the module to refuse.
+    chosen = [info for info in infos if not info.read_only or names or len(infos) == 1]
     with _answered(session, module):
         if target == module and not names:
             await network.reset_parameters(module)
         else:
-            for node, own in chosen.items():
-                await network.reset_parameters(module, node=node, names=own)
-    count = sum(map(len, chosen.values()))
+            await network.set_parameters(module, dict.fromkeys((info.node, info.name) for info in chosen))
+    count = len(chosen)
     notify(f"{module}: {count} parameter{'' if count == 1 else 's'} reset; the file of the module changes with save")
 
 

@@ -14,6 +14,7 @@ import r2p
 from r2p.tools.main import app
 from r2p.tools.param.changing import load, reset, save, set_
 from r2p.tools.session import TimedOut, UsageError
+from tests.bench import hold
 from tests.tools.param.test_reading import Mode, drive, turn
 from tests.tools.rig import printed, robot, tool
 
@@ -97,6 +98,18 @@ async def test_a_node_that_two_modules_have_must_be_named_with_its_module() -> N
             UsageError, match=r"several parameters of turn are kp: choose one of ARM/turn\.kp, BOT/turn"
         ):
             await set_(session, "turn", ["kp=1"])
+
+
+async def test_a_reset_of_several_nodes_is_all_or_nothing() -> None:
+    async def fixed(node: r2p.Node) -> None:
+        node.parameter("kp", 1.0, read_only=True)
+        await hold(node)
+
+    async with robot(drive, fixed) as module, tool() as session:
+        module.parameters.set({("drive", "kp"): 0.7})
+        with pytest.raises(r2p.ParameterError, match=r"BOT/fixed\.kp is read-only"):
+            await reset(session, "BOT", ["kp"])
+        assert module.parameters["drive", "kp"].value == 0.7
 
 
 async def test_save_and_reset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
