@@ -124,10 +124,12 @@ class NodeSwap:
         """Note that the module ends both nodes; the new one is cancelled afterwards.
 
         An old node that is handing over may have left its motors running. Then the new one takes over at once, as what
-        its clean-up publishes is to stop them.
+        its clean-up publishes is to stop them; nothing that it has published before.
         """
         self.interrupted = reason
         if self.old.node.handing_over:
+            for drop in self._replaced.drop_kept:
+                drop(f"held back until the node before had ended, and {reason}")
             self.old.node.close()
         self._woken.set()
 
@@ -153,6 +155,7 @@ class NodeSwap:
         if self.interrupted:
             return self._interruption()
         topics = await self._measure(ended_at)
+        self._replaced.drop_kept.clear()
         self._replaced.followed.clear()  # else each node would keep all those before it in memory
         self.old.node.replaced = ReplacedNode()
         return SwapResult(self.new.node, topics, cleaned_up)

@@ -468,6 +468,7 @@ async def test_a_stop_in_the_middle_of_a_swap_stops_the_motors(klass: Any, after
         assert (swap.exception() is None) is (after > 0.5)
         await asyncio.sleep(0.1)
         assert numbers(got)[-1] == 0
+        assert (2 in numbers(got)) is (after > 0.5)  # a STOP sets nothing in motion
         reading.cancel()
 
 

@@ -25,12 +25,13 @@ HELD_BACK = "held back until the node before has ended, and replaced by a newer 
 class ReplacedNode(msgspec.Struct, eq=False):
     """What a node, in a swap, replaces of another one: services by name, and publishers that have no successor yet.
 
-    `followed` has those that have one, with it.
+    `followed` has those that have one, with it, and `drop_kept` what drops the messages that these keep.
     """
 
     publishers: list[Any] = []
     services: list[str] = []
     followed: list[tuple[Any, Any]] = []
+    drop_kept: list[Callable[[str], None]] = []
 
 
 def hold(publisher: Publisher[Any] | SporadicPublisher[Any] | PeriodicPublisher[Any], replaced: ReplacedNode) -> None:
@@ -51,7 +52,7 @@ def hold(publisher: Publisher[Any] | SporadicPublisher[Any] | PeriodicPublisher[
         other.hand_over = lambda: _follow(publisher, other)
         publisher.abandon = lambda: _forget(other)
     else:
-        _HeldBack(publisher, other)
+        replaced.drop_kept.append(_HeldBack(publisher, other).drop_kept)
 
 
 def _follow(publisher: PeriodicPublisher[Any], other: Any) -> None:
@@ -74,6 +75,12 @@ class _HeldBack:
         self._kept: Any = None
         vars(publisher).update(publish=self._publish, publish_nowait=self._publish_nowait, abandon=self._abandon)
         other.hand_over = self._take_over
+
+    def drop_kept(self, reason: str) -> None:
+        """Drop the message that is kept, and report it as missed for this reason."""
+        if self._kept is not None:
+            self._kept = None
+            self._publisher.link_missed("", reason)
 
     def _take_over(self) -> Callable[[], None]:
         self._end()
@@ -116,7 +123,6 @@ class _HeldBack:
         if not self._holds:  # the program has kept the method
             return self._publisher.publish_nowait(message)
         self._publisher.check(message)
-        if self._kept is not None:
-            self._publisher.link_missed("", HELD_BACK)
+        self.drop_kept(HELD_BACK)
         self._kept = message
         return False
