@@ -34,7 +34,7 @@ def _read_description(path: Path, given: dict[str, Any]) -> AppDescription:
     content: dict[str, Any] = {}
     try:
         if beside.exists():
-            content = tomllib.loads(beside.read_text())
+            content = tomllib.loads(beside.read_text("utf-8"))
         return msgspec.convert(content | given, AppDescription)
     except OSError as error:
         raise AppFileError(f"can't read {beside}: {error.strerror}") from error

@@ -96,6 +96,6 @@ class DefinitionFile:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text()
+        return path.read_text("utf-8-sig")  # editors of Windows put a mark in front
     except (OSError, UnicodeDecodeError) as error:
         raise MessageError(f"can't read {path}: {getattr(error, 'strerror', None) or error}") from None

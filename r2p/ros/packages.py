@@ -19,7 +19,7 @@ OF_ROS = frozenset(
         *("trajectory", "visualization"),
     )
 )
-"""Packages that come with ROS, so that nobody has to build them."""
+"""Packages that come with ROS, which are left out."""
 
 _FIELD_OF_ROS2 = re.compile(r"[a-z](?:_?[a-z0-9])*")
 _TYPE_OF_ROS2 = re.compile(r"[A-Z][A-Za-z0-9]*")

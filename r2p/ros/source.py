@@ -23,6 +23,7 @@ from r2p.messages.shapes import (
     VariableArray,
     VariableText,
     is_reserved,
+    show,
 )
 from r2p.ros.classes import TIMES
 from r2p.ros.definitions import ConstantDefinition, Definitions, MessageDefinition
@@ -143,7 +144,7 @@ def _constant_value(constant: ConstantDefinition) -> str:
         real = float(text)
         return repr(real) if math.isfinite(real) else f'float("{real}")'
     except ValueError:
-        raise MessageError(f"{constant.type} {constant.name}={text}: that is not a value of this type") from None
+        raise MessageError(f"{constant.type} {constant.name}={show(text)}: that is not a value of this type") from None
 
 
 def _summary(definition: MessageDefinition) -> str:

@@ -40,7 +40,7 @@ def run(text: str) -> dict[str, Any]:
 def service(tmp_path: Path) -> Path:
     (tmp_path / "my_msgs" / "srv").mkdir(parents=True)
     (tmp_path / "my_other_msgs" / "msg").mkdir(parents=True)
-    (tmp_path / "my_other_msgs" / "msg" / "Joint.msg").write_text("float32 angle\n")
+    (tmp_path / "my_other_msgs" / "msg" / "Joint.msg").write_text("float32 angle\n", "utf-8-sig")
     file = tmp_path / "my_msgs" / "srv" / "Move.srv"
     file.write_text(SERVICE)
     return file
