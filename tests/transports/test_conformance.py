@@ -71,15 +71,17 @@ async def two_nodes(cable: Cable) -> AsyncIterator[tuple[r2p.Node, r2p.Node]]:
 @conforms
 async def test_every_message_type_both_ways(cable: Cable) -> None:
     async with two_nodes(cable) as (alice, bob):
-        for sender, receiver in ((alice, bob), (bob, alice)):
-            for number, cls in enumerate(EVERY):
-                topic = f"{sender.module}{number}"
-                publisher, subscriber = sender.advertise(topic, cls), receiver.subscribe(topic, cls)
-                await publisher.wait_subscriber()
-                await subscriber.wait_publisher()
-                message = filled(cls)
-                await publisher.publish(message)
-                assert await subscriber.fetch() == message
+        ways = [(way, cls) for cls in EVERY for way in ((alice, bob), (bob, alice))]
+        pairs = [
+            (cls, sender.advertise(f"t{number}", cls), receiver.subscribe(f"t{number}", cls))
+            for number, ((sender, receiver), cls) in enumerate(ways)
+        ]
+        for cls, publisher, subscriber in pairs:
+            await publisher.wait_subscriber()
+            await subscriber.wait_publisher()
+            message = filled(cls)
+            await publisher.publish(message)
+            assert await subscriber.fetch() == message
 
 
 @conforms
