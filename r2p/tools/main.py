@@ -22,7 +22,7 @@ from r2p.tools.output import abandon_stdout, notify
 GROUPS = {
     "topic": ("r2p.tools.topic", "List, watch, publish and measure topics."),
     "service": ("r2p.tools.service", "List, inspect and call services."),
-    "node": ("r2p.tools.node", "List and inspect nodes."),
+    "node": ("r2p.tools.node", "List nodes; start, stop and swap them."),
     "param": ("r2p.tools.param", "List, get, set and save parameters of nodes."),
     "module": ("r2p.tools.module", "List, stop and restart modules."),
     "app": ("r2p.tools.app", "List, load, remove and start the apps of a firmware module."),

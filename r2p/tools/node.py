@@ -149,6 +149,8 @@ def _find(wanted: str, nodes: Table) -> tuple[str, str]:
     paths = ", ".join(f"{module}/{node}" for module, node in found or nodes)
     if found:
         raise r2p.Error(f"there are several nodes {wanted}: choose one of {paths}")
+    if own := [f"{module}/{node}" for module, node in nodes if module == wanted]:
+        raise r2p.Error(f"{wanted} is a module, which r2p module info shows; its nodes: {', '.join(own)}")
     names = {name: f"{module}/{name}" for module, name in nodes} if not module else {}
     names |= {f"{module}/{name}": f"{module}/{name}" for module, name in nodes}
     close = difflib.get_close_matches(wanted, names, n=1)

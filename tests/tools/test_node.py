@@ -95,6 +95,10 @@ async def test_names_that_are_not_one_node() -> None:
             await info(session, "ARM/show")
         with pytest.raises(r2p.Error, match=r"no node ARM/driver; .* did you mean ARM/drive\?$"):
             await info(session, "ARM/driver")
+        with pytest.raises(
+            r2p.Error, match=r"ARM is a module, which r2p module info shows; its nodes: ARM/drive, ARM/log$"
+        ):
+            await info(session, "ARM")
 
 
 async def test_nobody_but_tools(capsys: pytest.CaptureFixture[str]) -> None:
