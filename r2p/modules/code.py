@@ -196,7 +196,8 @@ def _check_owner(path: Path, status: os.stat_result) -> None:
     if os.name != "posix":
         return
     if status.st_uid not in {0, os.geteuid()} or status.st_mode & stat.S_IWOTH:
-        raise Error(f"{path} belongs to another user, or everyone can write it: chown it, and chmod o-w")
+        do = "use another directory (--load-dir)" if stat.S_ISDIR(status.st_mode) else "chown it, and chmod o-w"
+        raise Error(f"{path} belongs to another user, or everyone can write it: {do}")
 
 
 def _read(path: Path) -> bytes:

@@ -171,7 +171,7 @@ ERRORS = {
     "a\0b.py:blink": "is not a path",
     "big.py:blink": "has more than 256 KiB",
     "loose.py:blink": "loose.py belongs to another user, or everyone can write it: chown it, and chmod o-w",
-    "open/blink.py:blink": "/open belongs to another user, or everyone can write it",
+    "open/blink.py:blink": "/open belongs to another user, or everyone can write it: use another directory",
 }
 
 
