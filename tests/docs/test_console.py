@@ -132,3 +132,10 @@ def test_the_commands_print_what_the_page_shows(page: Path, tmp_path: Path) -> N
         for block in todo:
             session.play(block)
         session.end()
+
+
+def test_a_port_that_was_put_in_is_not_replaced_again(tmp_path: Path) -> None:
+    """Nor one that is a part of a longer number."""
+    block = Block(tmp_path, 1, "toml", "ports", {}, "2323 2324 23230 tcp:127.0.0.1:2324")
+    Session(tmp_path, {"2323": "23243", "2324": "29418"}).play(block)
+    assert (tmp_path / "ports").read_text() == "23243 29418 23230 tcp:127.0.0.1:29418"
