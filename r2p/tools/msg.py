@@ -47,18 +47,31 @@ async def list_(*, format: Format = None) -> None:
 @app.command("show")
 @standalone
 async def show(type: TypeArgument, *, format: Format = None) -> None:
-    """Show a type: its size, fingerprint and fields."""
+    """Show a type: its size, fingerprint, sums in ROS, and fields."""
     output = Output(format)
     cls = Types(settings()).load(type)
     shape = r2p.layout(cls)
     pairs = (field.rpartition(":") for field in shape.schema.split())
     record = _row(cls) | {
         "fingerprint": shape.fingerprint.hex(),
+        "ros1_md5": _of_ros(cls, "ros1_md5"),
+        "ros2_hash": _of_ros(cls, "ros2_hash"),
         "fields": {path: kind for path, _, kind in pairs},
     }
     if output.format == "text":
         record["size"] = size_text(shape.size, varies=shape.varies)
     await output.put(record)
+
+
+def _of_ros(cls: type[r2p.Message], what: str) -> str | None:
+    """Return what ROS compares of a type; None for a type that it can't define, or defines in another way."""
+    from r2p.ros import sums
+
+    try:
+        text: str = getattr(sums, what)(cls)
+    except r2p.MessageError:
+        return None
+    return text
 
 
 @app.command("export")

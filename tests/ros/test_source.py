@@ -12,6 +12,7 @@ from r2p.ros.definitions import md5, parse
 from r2p.ros.library import DefinitionFile, definitions_of_ros
 from r2p.ros.packages import packages
 from r2p.ros.source import source
+from r2p.ros.sums import ros1_md5, ros2_hash
 from r2p.tools.types import standard_types
 
 SERVICE = """# Moves the arm.
@@ -129,3 +130,15 @@ class Motor(r2p.Message, name="my_msgs/Motor"):
 def test_what_ros2_can_not_define(cls: type[r2p.Message], error: str) -> None:
     with pytest.raises(r2p.MessageError, match=error):
         packages([cls], 2)
+
+
+def test_sums_are_those_of_ros_where_it_has_the_type() -> None:
+    assert ros1_md5(LaserScan) == "90c7ef2dc6895d81024acba2ac42f369"
+    assert ros2_hash(LaserScan) == "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"
+    assert ros1_md5(r2p.msg.Led) == "004c3c9a6f99efbd0231bbcef249f38c"
+
+    class Imu(r2p.Message, name="sensor_msgs/Imu"):
+        x: r2p.f32
+
+    with pytest.raises(r2p.MessageError, match="sensor_msgs/Imu of ROS 1 has other fields than Imu"):
+        ros1_md5(Imu)

@@ -62,7 +62,9 @@ def test_all_known_types_are_listed(tmp_path: Path) -> None:
     own = {"type": "robot/Grid", "size": layout(Grid).size, "varies": False, "class": f"{__name__}:Grid"}
     assert [row for row in rows if row["type"].startswith("robot/")] == [own]
     assert len(rows) == len(standard_types()) + 1
-    assert json.loads(run("show", "robot/Grid").stdout)["fields"]["cells[2][1].class"] == "i8"
+    grid = json.loads(run("show", "robot/Grid").stdout)
+    assert grid["fields"]["cells[2][1].class"] == "i8"
+    assert (grid["ros1_md5"], grid["ros2_hash"]) == (None, None), "ROS has no arrays of arrays"
 
 
 def test_show() -> None:
@@ -72,6 +74,8 @@ def test_show() -> None:
         "varies": True,
         "class": "r2p.msg:PointField",
         "fingerprint": layout(PointField).fingerprint.hex(),
+        "ros1_md5": "268eacb2962780ceac86cbd17e328150",
+        "ros2_hash": "RIHS01_5c6a4750728c2bcfbbf7037225b20b02d4429634732146b742dee1726637ef01",
         "fields": {"name": "str", "offset": "u32", "datatype": "u8", "count": "u32"},
     }
 
