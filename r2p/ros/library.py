@@ -26,12 +26,16 @@ def definitions_of_ros(name: str, version: int) -> dict[str, MessageDefinition]:
     store = _store(version)
     full = name.replace("/", "/msg/")
     if full not in store.types:
-        known = [each.replace("/msg/", "/") for each in store.types]
-        close = difflib.get_close_matches(name, known, n=1)
+        close = difflib.get_close_matches(name, names_of_ros(version), n=1)
         advice = f"did you mean {close[0]}?" if close else "give the path of its .msg file"
         raise MessageError(f"ROS {version} comes without a type {name}; {advice}")
     text, _ = store.generate_msgdef(full, ros_version=version)
     return parse(name, text)
+
+
+def names_of_ros(version: int) -> list[str]:
+    """Return the names of all types that come with ROS 1 or 2. Raises MessageError if rosbags is missing."""
+    return [each.replace("/msg/", "/") for each in _store(version).types]
 
 
 @functools.cache

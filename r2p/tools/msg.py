@@ -9,7 +9,7 @@ import typer
 import r2p
 from r2p.messages import SIZE_MAX
 from r2p.tools.c_header import c_header, header_path, with_nested
-from r2p.tools.completion import complete_type
+from r2p.tools.completion import beginning, complete_type, silence
 from r2p.tools.options import Format
 from r2p.tools.output import Output, notify
 from r2p.tools.session import UsageError, group, settings, standalone
@@ -134,13 +134,25 @@ def _export_ros(folder: Path, version: int, classes: list[type[r2p.Message]]) ->
     notify(f"{', '.join(written)} in {folder}: put it into the src of a workspace, and run {build}")
 
 
+def _complete_ros_type(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Completions for a type that comes with ROS."""
+    with silence():
+        from r2p.ros.library import names_of_ros
+
+        return beginning(incomplete, names_of_ros(1 if ctx.params.get("ros1") else 2))
+    return []
+
+
 @app.command("import")
 @standalone
 async def import_(
     type: Annotated[
         str,
         typer.Argument(
-            metavar="TYPE", show_default=False, help="sensor_msgs/Imu, or the path of a .msg, .srv or .action file."
+            metavar="TYPE",
+            autocompletion=_complete_ros_type,
+            show_default=False,
+            help="sensor_msgs/Imu, or the path of a .msg, .srv or .action file.",
         ),
     ],
     *,

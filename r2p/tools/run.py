@@ -29,6 +29,7 @@ from r2p.names import NODE_MAX, module_name_from, node_name, topic_name
 from r2p.parameters.sources import ParameterSource, from_options, of_module, read_file
 from r2p.tools.config import Settings
 from r2p.tools.options import Param, Params, ParamsFile, Via
+from r2p.tools.output import notify
 from r2p.tools.session import UsageError, check_urls, service, settings
 
 logger = logging.getLogger("r2p.runner")
@@ -120,9 +121,12 @@ def parameter_sources(
 ) -> list[ParameterSource]:
     """Return where first values of parameters come from; of several files, the last one wins. Raises UsageError."""
     try:
+        tables = [(path, read_file(path, module)) for path in files]
+        for path in (path for path, table in tables if not table.values):
+            notify(f"{path} has no parameters of {module}: their tables are [params.{module}.node]")
         return [
             of_module(module, chosen.params, Origin.CONFIG, "r2p.toml"),
-            *(read_file(path, module) for path in reversed([*files])),
+            *(table for _, table in reversed(tables)),
             from_options(options),
         ]
     except r2p.ParameterError as error:

@@ -384,6 +384,14 @@ def test_options_of_parameters_that_mean_nothing(
         parameter_sources("PC1", settings(), map(Path, files), options)
 
 
+def test_a_file_for_other_modules_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (path := tmp_path / "gains.toml").write_text("[params.PC2.speed]\nkp = 1\n")
+    assert parameter_sources("PC1", settings(), [path], [])
+    assert f"{path} has no parameters of PC1: their tables are [params.PC1.node]" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
 @pytest.mark.processes
 def test_options_reach_the_nodes_and_a_value_that_does_not_fit_is_an_error_of_its_node(tmp_path: Path) -> None:
     (tmp_path / "gains.py").write_text(GAINS)
