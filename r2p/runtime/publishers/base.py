@@ -38,6 +38,16 @@ class BasePublisher(Generic[M, C]):
 
     publisher_class: PublisherClass
 
+    # Of a swap of the node (`held`); in the class, as an object of more than 30 attributes is larger and slower.
+    hand_over: Callable[[], Callable[[], None] | None] | None = None
+    """Lets the publisher that replaces this one go on here; returns what then sends the messages that it held back."""
+    abandon: Callable[[], None] | None = None
+    """Called if a publisher is closed that is held back."""
+    held_back = 0
+    """Calls of `publish()` that are held back."""
+    first_at = 0
+    """The instant of the first message in place of another publisher (monotonic ns); 0: none yet."""
+
     def __init__(
         self,
         space: TopicSpace,
@@ -62,16 +72,6 @@ class BasePublisher(Generic[M, C]):
         """Messages that did not reach every subscriber in time."""
         self.late = 0
         """Messages that were published or sent after their time."""
-        self.hand_over: Callable[[], Callable[[], None] | None] | None = None
-        """Lets the publisher that replaces this one go on here, and returns what then sends the messages that it held
-        back. Set in a swap of the node (`held`), as the next two.
-        """
-        self.abandon: Callable[[], None] | None = None
-        """Called if a publisher is closed that is held back."""
-        self.held_back = 0
-        """Calls of `publish()` that are held back."""
-        self.first_at = 0
-        """The instant of the first message in place of another publisher (monotonic ns); 0: none yet."""
         self._class = klass
         self._on_missed = klass.on_missed
         self._on_late: Signal | None = klass.on_late
