@@ -249,7 +249,7 @@ class Battery(Message):
 class PowerEvent(Message):
     """The power supply crossed thresholds (topic `power_event`, thesis 7.2.2). 1 fragment.
 
-    Several thresholds are added up: 0 is none of them.
+    Several thresholds are added up; 0 means that none is exceeded.
     """
 
     LOW_VOLTAGE: ClassVar = 1
@@ -389,7 +389,7 @@ class GatewayStatus(Message):
     """Messages in the last second."""
 
 
-class BusLoad(Message):
+class BusTraffic(Message):
     """What a topic of a module took of an RTCAN bus in the last second (topic `bus_load`), stuff bits included.
 
     There is one message for each topic of each module, and one for the whole bus, with `kind` "total". They are sent

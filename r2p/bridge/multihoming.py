@@ -171,7 +171,7 @@ class MultihomedModule:
         return max(((info.size, info.varies) for info in infos if info is not None), default=(0, False))
 
     def _drop_filter(self, topic: Topic) -> Callable[[str], bool]:
-        """Return a predicate, by the name of a link: whether messages from it are dropped, as it is no longer used.
+        """Return a function that says whether messages from a link, by name, are dropped, as it is no longer used.
 
         It is asked before each message while gateways consent to the use of several links for a while only: a module
         that was stopped must not go on with them.

@@ -11,7 +11,7 @@ import msgspec
 from r2p.keys import SharedKey
 
 ANY_SESSION = 0
-"""Challenge.session: whoever is at the other end of the line."""
+"""Challenge.session: any module at the other end of the line."""
 NONCE = 16
 """Bytes of Challenge.nonce."""
 COUNTER_MAX = 0xFFFFFFFF

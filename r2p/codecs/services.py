@@ -91,7 +91,7 @@ def decode(data: bytes) -> ServiceHeader:
 def encode_text(text: str, room: int) -> bytes:
     """Encode the text of an error in at most `room` bytes of UTF-8; a text that is cut off ends with `...`.
 
-    In less than `TEXT_MIN` bytes it would not help anyone: then there is none.
+    With less than `TEXT_MIN` bytes it would be of no use: then the text is empty.
     """
     if room < TEXT_MIN:
         return b""

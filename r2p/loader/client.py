@@ -47,8 +47,8 @@ class LoaderClient:
             await loader.leave()
 
     `module` is an open module of this program, and `name` that of the firmware. `patience` is the time for an answer
-    in seconds. Use it from one task at a time. All methods raise LoaderError, of which LoaderSilent means no answer and
-    LoaderRefused a NACK; after either, the next call begins anew. The module stays in its loader until `leave`.
+    in seconds. Use it from one task at a time. All methods raise LoaderError: LoaderSilent without an answer,
+    LoaderRefused after a NACK; after either, the next call begins anew. The module stays in its loader until `leave`.
 
     Raises InvalidName or NameTooLong.
     """

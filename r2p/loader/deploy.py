@@ -37,7 +37,7 @@ class LoadedApp(msgspec.Struct, frozen=True):
 
     @property
     def size(self) -> int:
-        """Bytes of its program and its .data, of which nothing but the config area can be read back."""
+        """Bytes of its program and its .data; only the config area can be read back."""
         return self.app.setup.pgmlen + self.app.setup.datalen
 
 

@@ -154,7 +154,7 @@ def load(
 
 
 def remove_last() -> Procedure[None]:
-    """Remove the last app. Raises LoaderRefused if there is none."""
+    """Remove the last app. Raises LoaderRefused if no app is installed."""
     yield from _begin(BeginLoader(), Ack)
     yield from _ask(RemoveLast(), Ack)
     yield from _ask(EndLoader(), Ack)

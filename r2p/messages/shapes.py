@@ -327,7 +327,7 @@ class Len(msgspec.Struct, frozen=True):
 
 
 class Max(msgspec.Struct, frozen=True):
-    """In `Annotated`: the elements of an array, or the bytes of a text, of which there are at most so many.
+    """In `Annotated`: the elements of an array, or the bytes of a text, at most so many.
 
     It bounds what a receiver allocates, and decides which links can carry the message. It is not a part of the type:
     publisher and subscriber may differ in it.

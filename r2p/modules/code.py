@@ -41,7 +41,7 @@ class CodeLoader:
     """Loads functions from the files of one directory, and from code that was sent."""
 
     def __init__(self, directory: Path) -> None:
-        """Raises Error if there is no such directory, or other users can write it."""
+        """Use this directory. Raises Error for a missing one, and for one that other users can write."""
         self.directory = directory.resolve()
         if not self.directory.is_dir():
             raise Error(f"allow_load: there is no directory {directory}")

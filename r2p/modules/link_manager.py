@@ -140,7 +140,7 @@ class LinkManager:
         self._other_versions: set[str] = set()
         """Names of modules whose wire version was reported."""
         self._used_clients: set[Link] = set()
-        """Links of clients, of which a module was heard that is not a tool."""
+        """Links of clients by which a module was heard that is not a tool."""
         self._limits: dict[Link, LineLimit] = {}
         self._clients = LineLimit()
         self._refusals = LineLimit(1, _REFUSED_APART)

@@ -373,7 +373,10 @@ class Module:
         return await self._nodes.swap(old, function, args, name, limits or SwapLimits(), options)
 
     async def stop_node(self, name: str) -> None:
-        """End one node, and wait for its end. Raises Error if there is none, and Closed if the module is not open."""
+        """End one node, and wait until it has cleaned up.
+
+        Raises Error if the module has no node of this name, and Closed if the module is not open.
+        """
         self._running()
         await self._nodes.stop(name)
 

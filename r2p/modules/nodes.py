@@ -102,7 +102,10 @@ class NodeTable:
         return supervisor.node
 
     async def stop(self, name: str) -> None:
-        """End a node, and wait for its end. Raises Error if there is none of this name, or it is being swapped."""
+        """End a node, and wait until it has cleaned up.
+
+        Raises Error if the module has no node of this name, and while the node is being swapped.
+        """
         await self._settled(name).stop()
 
     async def restart(self, name: str) -> Node:
@@ -175,7 +178,7 @@ class NodeTable:
         return Supervisor(function, args, lambda: self._make_node(chosen, options), options)
 
     def _settled(self, name: str) -> Supervisor:
-        """Return the node of this name. Raises Error if there is none, or it is being swapped."""
+        """Return the node of this name. Raises Error if the module has no such node, and while it is being swapped."""
         if name not in self.supervisors:
             known = ", ".join(self.supervisors) or "none"
             raise Error(f"module {self._module} has no node {name}; its nodes: {known}")

@@ -190,5 +190,5 @@ def _pause(entry: TopicPauseEntry) -> TopicPause:
 
 
 def _seconds(value: float, least: float) -> float | None:
-    """Return a time from outside; None if there is none, or it can't be one."""
+    """Return a time (s) that another module has sent; None for a missing or an impossible one."""
     return value if least <= value <= _LONGEST else None

@@ -52,7 +52,7 @@ class ParameterFile:
         """The file; a symbolic link stays one, and what it points to is replaced."""
 
     async def load(self, module: str) -> dict[Name, object]:
-        """Return what is saved for a module; nothing if there is no file yet. Raises ParameterError.
+        """Return the saved values of a module; without a file, no values. Raises ParameterError.
 
         Warns if nothing can be saved.
         """
@@ -82,7 +82,7 @@ class ParameterFile:
         )
 
     def _is_writable(self) -> bool:
-        """Return whether the directory allows a new file; True if there is none, which is an error of its own."""
+        """Return whether a file can be made in the directory; True for a missing directory, which is another error."""
         directory = Path(os.path.realpath(self.path)).parent
         return not directory.is_dir() or os.access(directory, os.W_OK | os.X_OK)
 

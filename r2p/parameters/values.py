@@ -60,7 +60,7 @@ def _kind_of_tuple(default: tuple[object, ...]) -> ParameterKind:
 
 
 def convert(kind: ParameterKind, value: object, *, like: Any) -> Any:
-    """Return a value as that of a parameter of this kind, whose default is `like`.
+    """Convert a value to the kind of a parameter whose default is `like`.
 
     An int converts to a float, a list to a tuple, and a name to the member of an enum. Raises ParameterError with the
     reason.

@@ -4,7 +4,7 @@ definitions   .msg, .srv and .action files; what ROS 1 computes from them
 hashes        the hashes of types in ROS 2
 classes       message classes of ROS types, and definitions of r2p's classes
 cdr           the serialisation of ROS 2; that of ROS 1 is r2p's own
-library       the definitions that come with ROS
+library       the definitions that come with ROS, and what the ends of a connection compare of a type
 source        Python source of message classes
 packages      packages for ROS with the types of r2p's classes
 """

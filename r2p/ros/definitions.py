@@ -252,7 +252,7 @@ def _md5_text(name: str, definitions: Definitions, outer: tuple[str, ...], known
 
 
 def find(name: str, definitions: Definitions, outer: tuple[str, ...] = ()) -> MessageDefinition:
-    """Return the definition of a type that is nested in the types `outer`. Raises MessageError if there is none."""
+    """Return the definition of a type that is nested in the types `outer`. Raises MessageError for a missing one."""
     if name in outer:
         raise MessageError(f"{name} contains itself")
     if name not in definitions:

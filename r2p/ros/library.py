@@ -1,6 +1,7 @@
 """The definitions that come with ROS, which rosbags has (extra `ros`), and those in folders of packages.
 
 definitions_of_ros("sensor_msgs/Imu", 2)     of ROS 1 (Noetic) or ROS 2 (the latest one that rosbags knows)
+ros1_md5(Imu), ros2_hash(Imu)                what the two ends of a connection compare of a class
 DefinitionFile(path).read(2)                 of a .msg, .srv or .action file, and of what it needs
 """
 
@@ -11,7 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from r2p.errors import MessageError
-from r2p.ros.definitions import MessageDefinition, parse, parse_action, parse_service, short_name
+from r2p.messages import Message, layout
+from r2p.ros.classes import RosTypes, definitions_of
+from r2p.ros.definitions import Definitions, MessageDefinition, md5, parse, parse_action, parse_service, short_name
+from r2p.ros.hashes import TypeDescriptions
+from r2p.ros.packages import OF_ROS
 
 _PARTS = {".srv": parse_service, ".action": parse_action}
 _FIRST_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
@@ -103,3 +108,31 @@ def _read(path: Path) -> str:
         return path.read_text("utf-8-sig")  # editors of Windows put a mark in front
     except (OSError, UnicodeDecodeError) as error:
         raise MessageError(f"can't read {path}: {getattr(error, 'strerror', None) or error}") from None
+
+
+# Of r2p's classes
+
+
+def ros1_md5(cls: type[Message]) -> str:
+    """Return the md5 sum of a message class in ROS 1. Raises MessageError for a type that ROS can't define."""
+    return md5(layout(cls).name, _definitions(cls, 1))
+
+
+def ros2_hash(cls: type[Message]) -> str:
+    """Return the hash of a message class in ROS 2. Raises MessageError for a type that ROS can't define."""
+    return TypeDescriptions(_definitions(cls, 2)).hash(layout(cls).name)
+
+
+def _definitions(cls: type[Message], version: int) -> Definitions:
+    """Return ROS's own definitions of a type that comes with it, as they have constants and bounds; else the class's.
+
+    Raises MessageError if rosbags is missing, which has these, or if ROS has other fields in this type.
+    """
+    shape = layout(cls)
+    if shape.name.partition("/")[0] not in OF_ROS:
+        return definitions_of(cls, version)
+    found = definitions_of_ros(shape.name, version)
+    theirs = layout(RosTypes(version, found).load(shape.name))
+    if theirs.schema != shape.schema:
+        raise MessageError(f"{shape.name} of ROS {version} has other fields than {cls.__name__}")
+    return found

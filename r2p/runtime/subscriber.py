@@ -284,7 +284,7 @@ class Subscriber(Generic[T]):
             self._sink.waiter = None
 
     def _next(self) -> T | None:
-        """Pop messages up to the next one that is fresh and decodes; return None if there is no such message."""
+        """Pop messages up to the next one that is fresh and decodes; return None if the queue has no such message."""
         sink, queue = self._sink, self.queue
         while queue:
             sample = queue.popleft()
@@ -380,7 +380,7 @@ class Subscriber(Generic[T]):
                 self._alarm.set(self._last_message + self._timeout)
 
     def _is_idle(self) -> bool:
-        """Return whether a time-out has no effect now: no reader waits, and there is no function to call."""
+        """Return whether a time-out has no effect now: no reader waits, and no function is to be called."""
         return self._sink.waiter is None and self._on_timeout is None
 
     def _check_silence(self) -> None:

@@ -189,7 +189,7 @@ class Topic:
         return blocked if blocked is None else self._remaining(blocked)
 
     def deliver_by(self, link: str, sample: Sample) -> list[Sink] | None:
-        """Offer the sample only to the subscribers behind one link, or to all if there are none; as `deliver`."""
+        """Offer the sample only to the subscribers behind one link; without any, to all subscribers. See `deliver`."""
         for remote in self.remote_subscribers:
             if remote.link_name == link:
                 blocked = self._send([remote], sample, None, None)

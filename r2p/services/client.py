@@ -411,7 +411,7 @@ class ServiceClient(Generic[Q, R]):
         return False
 
     def _target(self, server: str | None, last: str = "") -> Target | None:
-        """Return the server of this module, or the one to call by default; None if there is none that is known.
+        """Return the server of this module, or the one to call by default; None as long as no server is known.
 
         `last` is the module that the call was sent to: it gets repetitions as well, also when it has restarted.
         """
@@ -471,7 +471,7 @@ class ServiceClient(Generic[Q, R]):
                 raise NoServer(self._lacks_server(server))
 
     async def _look_again(self, end: float | None) -> None:
-        """Wait until a topic has a new end, or for a moment: who serves it may be announced a little later."""
+        """Wait until a topic has a new end, or for a moment: its server may be announced a little later."""
         at = self._space.loop.time() + _LOOK_AGAIN
         try:
             async with asyncio.timeout_at(at if end is None else min(at, end)):

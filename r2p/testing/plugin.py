@@ -117,7 +117,7 @@ def _raise_shown(error: Exception, config: pytest.Config) -> NoReturn:
 
 
 def _shorten(error: BaseException) -> None:
-    """Remove the frames of r2p and asyncio, unless there are no others."""
+    """Remove the frames of r2p and asyncio, unless all are of these."""
     from r2p.log_lines import internal
 
     kept = [each for each in _entries(error.__traceback__) if not internal(each.tb_frame.f_code.co_filename)]

@@ -144,7 +144,7 @@ async def nodes(session: Session) -> list[str]:
 
 
 def on_network(ctx: typer.Context, source: Source) -> list[str]:
-    """Return what there is on the network of the command line, R2P_VIA or r2p.toml; nothing if there is none."""
+    """Return what is on the network that the command line, R2P_VIA or r2p.toml names; empty without a network."""
     with silence():
         chosen = settings(list(ctx.params.get("via") or ()), tool=True)
         if not all(url.startswith(IN_ONE_PROGRAM) for url in chosen.via):

@@ -396,7 +396,7 @@ async def _collect_notices(module: r2p.Module, notices: dict[str, r2p.LinkNotice
 
 
 async def _reason_unreachable(session: Session) -> str:
-    """Wait for the link; return why there is none, or nothing."""
+    """Wait for the link; return the reason if it does not come up, else an empty text."""
     try:
         async with asyncio.timeout(_CONNECT):
             await session.fail_unless_connected()

@@ -104,7 +104,7 @@ class _Printer:
         self._last = asyncio.Event()
 
     async def run(self, count: int | None, timeout: float | None) -> None:
-        """Print `count` records (None: until cancelled). Raises TimedOut if there is none for `timeout` seconds."""
+        """Print `count` records (None: until cancelled). Raises TimedOut after `timeout` seconds without a record."""
         what = f"log record of {self._wanted}" if self._wanted else "log record"
         missing = f"no {what}"
         self._left = count

@@ -65,10 +65,10 @@ async def show(type: TypeArgument, *, format: Format = None) -> None:
 
 def _of_ros(cls: type[r2p.Message], what: str) -> str | None:
     """Return what ROS compares of a type; None for a type that it can't define, or defines in another way."""
-    from r2p.ros import sums
+    from r2p.ros import library
 
     try:
-        text: str = getattr(sums, what)(cls)
+        text: str = getattr(library, what)(cls)
     except r2p.MessageError:
         return None
     return text

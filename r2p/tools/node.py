@@ -118,7 +118,7 @@ async def info(
 
 
 def _details(found: r2p.NodeList | None, node: str) -> dict[str, Any]:
-    """Return what a module tells of one of its nodes; nothing if it does not."""
+    """Return what a module says of one of its nodes; an empty record if it does not answer."""
     known = next((each for each in found.nodes if each.node == node), None) if found is not None else None
     if known is None:
         return {}

@@ -56,7 +56,10 @@ async def find_node(session: Session, target: str, node: str | None = None) -> t
 
 
 async def module_of(session: Session, node: str) -> str:
-    """Return the only module that has a node. Raises r2p.Error if there are none or several, or it is a module."""
+    """Return the only module with a node of this name.
+
+    Raises r2p.Error if no module or several have one, and for the name of a module.
+    """
     _check_network(session)
     await session.settle()
     modules = r2p_modules(session)
@@ -78,7 +81,7 @@ async def module_of(session: Session, node: str) -> str:
 
 
 async def find_module(session: Session, name: str) -> r2p.RemoteNodes:
-    """Wait until a module is known, and return its nodes. Raises TimedOut if there is none of this name."""
+    """Wait until a module is known, and return its nodes. Raises TimedOut for an unknown module."""
     if not await is_module(session, name):
         found = sorted(
             {view.name for view in session.module.network.modules() if view.link and view.state != "observer"}

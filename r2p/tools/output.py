@@ -66,7 +66,7 @@ class Output:
 
     @contextlib.asynccontextmanager
     async def while_read(self) -> AsyncIterator[None]:
-        """Raise PipeClosed in the block as soon as the reader closes the pipe, also while there is no output."""
+        """Raise PipeClosed in the block as soon as the reader closes the pipe, also while nothing is printed."""
         fd = waitable(self._stream)
         if fd is None or not stat.S_ISFIFO(os.fstat(fd).st_mode):
             yield

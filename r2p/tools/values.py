@@ -114,7 +114,7 @@ def pick(message: Message, path: str, form: Form = "whole") -> Any:
 
 
 def _at(shape: Shape, value: Any, steps: list[str]) -> tuple[Shape | None, Any]:
-    """Return the shape and the value that are that many steps inside of others; no shape if there is no such place."""
+    """Return the shape and the value that these steps lead to; no shape for a place that does not exist."""
     for step in steps:
         index = int(step) if step.isdecimal() and len(step) <= _INDEX_DIGITS else -1
         match shape:
@@ -165,7 +165,7 @@ def _yaml(text: str) -> Any:
 
 
 def _json(text: str) -> Any:
-    """Return a mapping in JSON; None if it is none. JSON that YAML does not read has a pair of surrogates."""
+    """Return the mapping of a JSON text; None for others. YAML does not read JSON with a pair of surrogates."""
     try:
         return json.loads(text) if text.lstrip().startswith("{") else None
     except (ValueError, RecursionError):
@@ -291,7 +291,7 @@ def _is_bytes(shape: Shape) -> bool:
 
 
 def _bytes(text: str) -> Any:
-    """Return the bytes of a text in base64; `_invalid` if it is none."""
+    """Return the bytes of a text in base64; `_invalid` for any other text."""
     try:
         return base64.b64decode("".join(text.split()), validate=True)
     except (binascii.Error, ValueError):
@@ -325,7 +325,7 @@ def _shown(plain: Any) -> str:
 
 
 def _number(shape: Scalar, plain: Any) -> Any:
-    """Return the number or bool of a YAML text or a JSON value; `_invalid` if it is none."""
+    """Return the number or bool of a YAML text or a JSON value; `_invalid` for any other text."""
     if shape.kind == "bool":
         text = str(plain).lower()
         return True if text in _TRUE else False if text in _FALSE else _invalid

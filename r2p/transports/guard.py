@@ -324,7 +324,7 @@ def key_protocol(space: TopicSpace, key: SharedKey, end: LinkEnd) -> KeyProtocol
 
 
 def decoded(data: bytes) -> management.Management | None:
-    """Return a management message; None for bytes that are none."""
+    """Return a management message; None for bytes that do not decode."""
     try:
         return management.decode(data)
     except (DecodeError, UnknownType):

@@ -41,13 +41,13 @@ class Server(msgspec.Struct, frozen=True):
 
     @property
     def first_line(self) -> str:
-        """The first line of text that the server sent, such as SSH-2.0-OpenSSH_9.2; empty if there is none."""
+        """The first line of text that the server sent, such as SSH-2.0-OpenSSH_9.2; empty if it sent no text."""
         line = self.sent.partition(b"\n")[0].strip()
         return line.decode()[:_SHOWN_MAX] if line.isascii() and line.decode().isprintable() else ""
 
 
 async def identify_server(host: str, port: int) -> Server:
-    """Connect, and return what the server speaks. Raises OSError if there is no connection.
+    """Connect, and return what the server speaks. Raises OSError without a connection.
 
     The connection is closed again. It takes up to 1.2 s where the server sends nothing.
     """

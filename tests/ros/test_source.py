@@ -9,10 +9,9 @@ import r2p
 from r2p.msg import Header, LaserScan
 from r2p.ros.classes import RosTypes
 from r2p.ros.definitions import md5, parse
-from r2p.ros.library import DefinitionFile, definitions_of_ros
+from r2p.ros.library import DefinitionFile, definitions_of_ros, ros1_md5, ros2_hash
 from r2p.ros.packages import packages
 from r2p.ros.source import source
-from r2p.ros.sums import ros1_md5, ros2_hash
 from r2p.tools.types import standard_types
 
 SERVICE = """# Moves the arm.

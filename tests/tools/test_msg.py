@@ -109,7 +109,7 @@ def test_what_is_exported_by_default_and_what_is_not(tmp_path: Path) -> None:
     result = run("export", "--c", "include")
     fixed = [cls for cls in standard_types() if layout(cls).exact_size]
     assert {path.stem for path in tmp_path.rglob("*.h")} == {cls.__name__ for cls in fixed}
-    assert "left out, as their length varies: r2p_msgs/BusLoad, r2p_msgs/BusSlots, std_msgs/Empty" in result.stderr
+    assert "left out, as their length varies: r2p_msgs/BusTraffic, r2p_msgs/BusSlots, std_msgs/Empty" in result.stderr
     assert f"{len(fixed)} headers in include: compile with -I include" in result.stderr
 
 

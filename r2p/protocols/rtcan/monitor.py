@@ -111,7 +111,7 @@ class BusLoad(msgspec.Struct, frozen=True):
 
     @property
     def free_used(self) -> float:
-        """Return the used part of the unreserved time: by time, or by frames, of which a slot holds so many."""
+        """Return the used part of the unreserved time: by time, or by the frames that fit into a slot."""
         events = [tally for (_, _, kind), tally in self.tallies.items() if kind not in {FrameKind.SYNC, FrameKind.HRT}]
         by_time = self.share(sum(tally.bits for tally in events)) / self.free if self.free else 0.0
         by_frames = sum(tally.frames for tally in events) / self.free_frames if self.free_frames else 0.0

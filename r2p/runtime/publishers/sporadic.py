@@ -32,7 +32,7 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
         self._alarm = Alarm(space.loop, self._overdue)
 
     async def publish(self, message: M) -> None:
-        """Publish an event; return at once, even if there is no room for it yet.
+        """Publish an event; return at once, also while a queue has no room for it.
 
         Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
         """

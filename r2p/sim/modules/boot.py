@@ -13,7 +13,7 @@ import r2p
 from r2p.clock import Alarm, clock_of
 from r2p.codecs.loader import SIZE
 from r2p.names import LOADER_PREFIX, module_alias
-from r2p.sim.modules.launch import Halted, starting
+from r2p.sim.modules.installed import Halted, starting
 from r2p.sim.modules.loader import QUEUE, EmulatedLoader
 
 NODE = "boot"

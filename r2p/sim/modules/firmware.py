@@ -26,7 +26,7 @@ from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import DecodeError, Error
 from r2p.messages import Layout, Message, layout
 from r2p.names import LOADER_PREFIX, MANAGEMENT, MODULE_FIELD, TOPIC_FIELD, module_name, topic_name
-from r2p.sim.modules.launch import Halted, starting
+from r2p.sim.modules.installed import Halted, starting
 from r2p.sim.modules.loader import QUEUE, EmulatedLoader
 from r2p.units import MILLISECOND, SECOND
 

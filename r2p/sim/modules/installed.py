@@ -1,10 +1,11 @@
 """The apps in an emulated module's flash memory, one after the other: an entry, the code, the initial variables.
 
-Nothing but a signature marks an entry, and its lengths lead to the next one.
+Nothing but a signature marks an entry, and its lengths lead to the next one. `starting` are the apps that
+a module starts.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableSequence
 
 import msgspec
 
@@ -27,6 +28,10 @@ _CONFIG_MAX = 1 << 16
 
 class EndlessList(Error):
     """The list of apps leads back to itself."""
+
+
+class Halted(Error):
+    """The start of an app has halted the module, as at each start: only its loader helps."""
 
 
 class FlashApp(msgspec.Struct, frozen=True):
@@ -98,14 +103,14 @@ class InstalledApps:
         return apps[-1] if apps else None
 
     def free_address(self) -> int:
-        """Return the address for another app, 0 if there is no room at all."""
+        """Return the address for another app, 0 without any room."""
         address = self.memory.flash_start
         for app in self:
             address = app.nextadr
         return address if self._is_inside(address) else 0
 
     def linked(self, setup: LinkingSetup) -> LinkingAddresses | None:
-        """Return the addresses in flash for another app, without those in RAM; None if there is no room."""
+        """Return the addresses in flash for another app, without those in RAM; None without room."""
         infoadr = self.free_address()
         if not infoadr:
             return None
@@ -183,3 +188,24 @@ def entry(setup: LinkingSetup, addresses: LinkingAddresses, outcome: LinkingOutc
 def aligned(length: int, to: int) -> int:
     """Return the length, rounded up; it may wrap."""
     return -(-length // to) * to % ADDRESSES
+
+
+def starting(apps: InstalledApps, log: MutableSequence[str]) -> Iterator[FlashApp]:
+    """Yield the enabled apps, in the order in which they are in flash, and log each.
+
+    Raises Halted at an app whose stack is too small, and at a list of apps without an end.
+    """
+    started: list[FlashApp] = []
+    try:
+        for app in apps:
+            if not app.enabled:
+                continue
+            log.append(f"LAUNCH {app.name}")
+            if app.setup.stacklen < apps.memory.least_stack:
+                least = apps.memory.least_stack
+                raise Halted(f"app {app.name}: a stack of {app.setup.stacklen} bytes is too small, it takes {least}")
+            log.extend(f"{app.name} shares RAM with {each.name}" for each in started if app.shares_ram_with(each))
+            started.append(app)
+            yield app
+    except EndlessList as error:
+        raise Halted(f"{error}: it hangs") from error

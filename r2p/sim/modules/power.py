@@ -84,7 +84,7 @@ class Powered:
         return bound
 
     def open_pty(self) -> str:
-        """Serve the line on a new pseudo terminal, and return its device name. Raises OSError where there are none."""
+        """Serve the line on a new pseudo terminal, and return its device name. Raises OSError without any."""
         end = _Pty(self)
         self._ends.add(end)
         return end.device

@@ -130,7 +130,7 @@ def _signals(group: Group) -> Iterator[None]:
 
 
 def check_network(path: Path, entries: list[Entry], settings: Settings) -> None:
-    """Raise UsageError if a condition needs a network, but there is none, or its URL is not valid."""
+    """Raise UsageError for a condition that needs a network, if none is named, or its URL is not valid."""
     for entry in entries:
         if entry.seen and not settings.via:
             raise UsageError(

@@ -78,7 +78,7 @@ class LinePrinter:
 
 
 def _columns(sink: int) -> int:
-    """Return the columns of a terminal; 0: it is none."""
+    """Return the columns of a terminal; 0 if it is not a terminal."""
     try:
         return os.get_terminal_size(sink).columns
     except OSError:

@@ -151,7 +151,7 @@ def _assigned(target: str, words: list[str]) -> tuple[str, list[tuple[str, str]]
 
 
 def _values(infos: Infos, reference: str, pairs: list[tuple[str, str]]) -> list[Value]:
-    """Return the parameters with the values that the texts stand for. Raises ParameterError for one that is none."""
+    """Return the parameters with the values that the texts stand for. Raises ParameterError for other texts."""
     values: dict[str, Value] = {}
     for name, text in pairs:
         chosen = of_name(infos, name) if name else infos

@@ -48,7 +48,7 @@ async def find(session: Session, target: str | None, names: Iterable[str] = (), 
 
 
 async def find_modules(session: Session, target: str | None, wait: float | None = None) -> list[str]:
-    """Return the r2p modules that a reference may mean; of a node alone, all. Raises TimedOut if there is none."""
+    """Return the r2p modules that a reference may mean; of a node alone, all. Raises TimedOut without an answer."""
     if not session.settings.via:
         raise UsageError("no network to look for parameters on: give --via tcp:HOST:PORT or set R2P_VIA")
     await session.settle(wait=wait or 0)

@@ -186,7 +186,7 @@ class _Publication(msgspec.Struct):
 
     @contextlib.asynccontextmanager
     async def _reporting(self, publisher: AnyPublisher, message: r2p.Message, rate: float) -> AsyncIterator[None]:
-        """Report what the block publishes, and to whom: a number of messages at the end, else once at the start.
+        """Report what the block publishes, and its subscribers: a number of messages at the end, else at the start.
 
         A number of messages first waits for a subscriber.
         """
@@ -213,7 +213,7 @@ class _Publication(msgspec.Struct):
         logger.info("publishing %s to %s", self.topic, await self._subscribers())
 
     async def _report_sent(self, publisher: AnyPublisher) -> None:
-        """Report how many messages were sent, and to whom."""
+        """Report how many messages were sent, and to which subscribers."""
         to = f" to {await self._subscribers()}" if publisher.subscribers else ", but no subscriber is left"
         logger.info(
             "%d %s of %s sent%s", publisher.sent, "message" if publisher.sent == 1 else "messages", self.topic, to

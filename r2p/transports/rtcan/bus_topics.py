@@ -18,7 +18,7 @@ from r2p.codecs.own_services import WIRE_MIN
 from r2p.errors import TypeMismatch
 from r2p.log_lines import get_logger
 from r2p.messages import layout
-from r2p.msg import BusLoad, BusSlots
+from r2p.msg import BusSlots, BusTraffic
 from r2p.names import BUS_LOAD, BUS_SLOTS, module_alias
 from r2p.protocols.rtcan import monitor
 from r2p.protocols.rtcan.monitor import FrameKind, Monitor
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 logger = get_logger("r2p.rtcan")
 
-_TYPES: dict[str, type[BusLoad | BusSlots]] = {BUS_LOAD: BusLoad, BUS_SLOTS: BusSlots}
+_TYPES: dict[str, type[BusTraffic | BusSlots]] = {BUS_LOAD: BusTraffic, BUS_SLOTS: BusSlots}
 _LOOK_INTERVAL = SECOND // 5  # ns between two looks for subscribers
 _TURN = SECOND  # ns that a module gives each module that is to publish rather than itself
 _READ_AFTER = 40 * MILLISECOND  # ns after a second until its last frames are read
@@ -185,9 +185,9 @@ class BusReporter:
         known = (each.name for each in discovery.modules.values() if each.source == id8 and not each.hops)
         return next(known, "") if id8 else ""
 
-    def _load_rows(self, load: monitor.BusLoad) -> Iterator[BusLoad]:
+    def _load_rows(self, load: monitor.BusLoad) -> Iterator[BusTraffic]:
         bus, seconds = _cut(self._link.title, _BUS_MAX), load.elapsed / SECOND
-        yield BusLoad(
+        yield BusTraffic(
             bus=bus,
             kind="total",
             share=load.total,
@@ -198,7 +198,7 @@ class BusReporter:
         )
         by_bits = sorted(load.tallies.items(), key=lambda each: -each[1].bits)
         for (topic, module, kind), tally in by_bits:
-            yield BusLoad(
+            yield BusTraffic(
                 bus=bus,
                 kind=kind.value,
                 topic=self._short(topic),

@@ -172,7 +172,7 @@ class SlottedTopics:
             each.publisher.link_degraded(self._link.name, f"slots lost: {event.reason}")
 
     def fill(self, due: Due) -> None:
-        """Give the engine the data of a slot, or nothing if a tick is due without a slot."""
+        """Give the engine the data of a slot; do nothing for a tick without a slot."""
         each = self._by_high.get(due.high)
         payload = self._payload(each, due) if each is not None and due.slotted else None
         self._driver.carry_out(self._driver.engine.fill(self._driver.now(), due.high, payload))

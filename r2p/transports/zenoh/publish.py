@@ -55,7 +55,7 @@ class TxStream:
         self.varies = False
         """True if the messages vary in length, so that headers carry the lengths."""
         self.large: LargeSender | None = None
-        """Sends large packets; None if all messages are so short that nobody need count their bytes."""
+        """Sends large packets; None if all messages of the topic are short."""
         self.urgent = urgent
         """True if messages never wait, not even for the end of the loop's turn."""
         self.source: Source | None = None

@@ -127,7 +127,7 @@ class RxStream:
         return max((queue.size_max for queue in self.topic.queues), default=layout.size), True
 
     def fingerprint_of(self, source: Source) -> bytes:
-        """Return the fingerprint in the headers of a publisher's messages; ANY_TYPE if there is none."""
+        """Return the fingerprint in the headers of a publisher's messages; ANY_TYPE for headers without one."""
         origins = (each.origin for each in self._headers.known.values() if each.source == source)
         return next((origin.fingerprint for origin in origins), ANY_TYPE)
 
@@ -524,7 +524,7 @@ class ZenohReceiver:
     # Publishers
 
     def fingerprint_of(self, topic: str, source: Source) -> bytes:
-        """Return the fingerprint in the headers of a publisher's messages; ANY_TYPE if there is none."""
+        """Return the fingerprint in the headers of a publisher's messages; ANY_TYPE for headers without one."""
         stream = self._streams.get(topic)
         return ANY_TYPE if stream is None else stream.fingerprint_of(source)
 

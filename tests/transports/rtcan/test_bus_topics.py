@@ -12,7 +12,7 @@ from r2p.clock import clock_of
 from r2p.codecs import rtcan
 from r2p.codecs.can_bits import INTERMISSION
 from r2p.messages import layout
-from r2p.msg import BusLoad, BusSlots, Led
+from r2p.msg import BusSlots, BusTraffic, Led
 from r2p.sim.transport import SimPort
 from r2p.testing.network import node_in
 from r2p.tools.topic.echo import echo
@@ -46,7 +46,7 @@ async def behind_gateway(bus: Lab) -> AsyncIterator[r2p.Node]:
         yield node
 
 
-async def second_of(samples: AsyncIterator[r2p.Sample[BusLoad]]) -> list[r2p.Sample[BusLoad]]:
+async def second_of(samples: AsyncIterator[r2p.Sample[BusTraffic]]) -> list[r2p.Sample[BusTraffic]]:
     """The messages of the next second, from its total on."""
     async for first in samples:
         if first.message.kind == "total":
@@ -59,14 +59,14 @@ async def second_of(samples: AsyncIterator[r2p.Sample[BusLoad]]) -> list[r2p.Sam
     return rows
 
 
-def period_end(total: r2p.Sample[BusLoad]) -> int:
+def period_end(total: r2p.Sample[BusTraffic]) -> int:
     """The end of the second that was measured, in true time (ns)."""
     return total.stamp - (clock_of().now() - clock_of().monotonic()) - READ_AFTER
 
 
 async def test_the_numbers_are_those_of_the_bus() -> None:
     async with lab("MOTOR", "EYE") as (bus, nodes), encoder(bus, nodes):
-        samples = nodes[1].subscribe("bus_load", BusLoad, queue=100).samples()
+        samples = nodes[1].subscribe("bus_load", BusTraffic, queue=100).samples()
         await second_of(samples)
         rows = await second_of(samples)
         end = period_end(rows[0])
@@ -92,7 +92,7 @@ async def test_the_numbers_are_those_of_the_bus() -> None:
 
 async def test_error_frames_are_counted() -> None:
     async with lab("MOTOR", "EYE") as (bus, nodes), encoder(bus, nodes):
-        samples = nodes[0].subscribe("bus_load", BusLoad, queue=100).samples()
+        samples = nodes[0].subscribe("bus_load", BusTraffic, queue=100).samples()
         assert (await second_of(samples))[0].message.errors == 0
         bus.can.bus.noise = 0.2
         rows = await second_of(samples)
@@ -104,7 +104,7 @@ async def test_error_frames_are_counted() -> None:
 
 async def test_it_reaches_a_subscriber_behind_a_gateway_and_costs_the_bus_nothing() -> None:
     async with lab("MOTOR", "EYE") as (bus, nodes), encoder(bus, nodes), behind_gateway(bus) as node:
-        samples = node.subscribe("bus_load", BusLoad).samples()
+        samples = node.subscribe("bus_load", BusTraffic).samples()
         rows = await second_of(samples)
         await second_of(samples)
         assert {each.source.module for each in rows} == {"GATE"}
@@ -120,7 +120,7 @@ async def test_without_a_subscriber_nothing_is_advertised_and_frames_are_filtere
         port = bus.link("EYE").driver.port  # of both, the first by name publishes
         assert isinstance(port, SimPort)
         filters = port.controller.filters
-        subscriber = nodes[0].subscribe("bus_load", BusLoad)
+        subscriber = nodes[0].subscribe("bus_load", BusTraffic)
         await second_of(subscriber.samples())
         assert bus.host("MOTOR").network.topics()["bus_load"].publishers
         assert "bus_slots" not in bus.host("MOTOR").network.topics()
@@ -133,7 +133,7 @@ async def test_without_a_subscriber_nothing_is_advertised_and_frames_are_filtere
 
 async def test_one_module_of_a_bus_publishes_and_another_takes_over() -> None:
     async with lab("A", "B") as (bus, nodes), encoder(bus, nodes):
-        samples = nodes[1].subscribe("bus_load", BusLoad, queue=500).samples()
+        samples = nodes[1].subscribe("bus_load", BusTraffic, queue=500).samples()
         async with bus.module("0"):
             await asyncio.sleep(5.0)
             while (await second_of(samples))[0].source.module != "0":
@@ -191,5 +191,5 @@ async def test_a_topic_of_another_type_with_the_name_is_left_alone(caplog: pytes
 
 
 def test_the_messages_fit_a_debug_line() -> None:
-    assert layout(BusLoad).size <= LINE_MAX
+    assert layout(BusTraffic).size <= LINE_MAX
     assert layout(BusSlots).size <= LINE_MAX
