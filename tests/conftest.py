@@ -15,6 +15,7 @@ import hypothesis
 import pytest
 
 from r2p.testing import plugin
+from r2p.transports.zenoh import config
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -71,3 +72,13 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
 )
 def anyio_backend(request: pytest.FixtureRequest) -> tuple[str, dict[str, Any]]:
     return "asyncio", request.param
+
+
+@pytest.fixture(scope="session", autouse=True)
+def patient_zenoh() -> None:
+    """Sessions in the tests' process don't lose their connections when a busy machine stops it for a second.
+
+    Their proxies run in the event loop of the test, which then forwards no sign of life. Started programs keep r2p's
+    lease, and so do the tests of a hanging one.
+    """
+    config._NEEDED["transport/link/tx/lease"] = 20_000

@@ -123,7 +123,7 @@ async def test_files_that_are_none(tmp_path: Path, text: str | None, says: str) 
 
 @pytest.mark.anyio
 async def test_what_the_file_says_counts(tmp_path: Path) -> None:
-    from r2p.transports.zenoh.config import build_config, connection_settings
+    from r2p.transports.zenoh.config import _NEEDED, build_config, connection_settings
 
     file = tmp_path / "zenoh.json5"
     file.write_text(
@@ -136,7 +136,7 @@ async def test_what_the_file_says_counts(tmp_path: Path) -> None:
     assert connection_settings(config).endpoints == ["tls/robot:7447"]
     assert connection_settings(config).tls.root == "ca.pem"
     ours = build_config(options("zenoh:"))
-    assert ours.get_json("transport/link/tx/lease") == "1000"
+    assert ours.get_json("transport/link/tx/lease") == str(_NEEDED["transport/link/tx/lease"])
 
 
 @pytest.mark.anyio
