@@ -96,4 +96,4 @@ $(LOWEST)/stamp: pyproject.toml
 # What the tests use of the system: installed for root, unpacked for others, else they say what they skip.
 .PHONY: system
 system: $(STAMP)
-	@$(BIN)/python -m tests.uml.packages
+	@$(BIN)/python -m tests.debian
