@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 import r2p
-from r2p.msg import Led, Odometry, Text
+from r2p.msg import Led, Odometry, String, Text
 from r2p.sim.modules import FirmwareModule, Powered, Subscribes
 from r2p.sim.robots.emulated import Triskar2
 from r2p.testing.network import node_in
@@ -28,6 +28,14 @@ from r2p.tools.run import load
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 LONGEST = 60
+TYPES = {"turtlesim"}
+"""Examples without a node: message types that others import."""
+
+
+@pytest.fixture(autouse=True)
+def _beside_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let examples import each other, as those that are run in their folder do."""
+    monkeypatch.syspath_prepend(EXAMPLES[0].parent)
 
 
 def _example(name: str) -> dict[str, Any]:
@@ -53,7 +61,7 @@ def test_the_command_runs_its_nodes(file: Path) -> None:
     """The functions with a node as their only parameter, and a valid name."""
     functions = inspect.getmembers(SimpleNamespace(**runpy.run_path(str(file))), inspect.iscoroutinefunction)
     nodes = [name for name, function in functions if list(inspect.signature(function).parameters) == ["node"]]
-    assert nodes
+    assert bool(nodes) != (file.stem in TYPES)
     assert [program.name for program in load(f"{file}:{name}" for name in nodes)] == nodes
 
 
@@ -135,6 +143,43 @@ async def test_square() -> None:
             for corner in nearest:
                 nearest[corner] = min(nearest[corner], math.dist(corner, robot.pose[:2]))
     assert max(nearest.values()) < 0.06
+
+
+@pytest.mark.virtual_time
+async def test_a_turtle_draws_a_star(capsys: pytest.CaptureFixture[str]) -> None:
+    """A second time it finds its turtle there."""
+    async with r2p.Module("PC1") as module:
+        module.start(_example("turtles")["turtlesim"])
+        for name in ("first", "second"):
+            module.start(_example("turtle_client")["star"], name=name)
+            await asyncio.sleep(30.0)
+            assert not module.nodes[name].running
+    rows = capsys.readouterr().out.splitlines()
+    drawn = [row for row in rows if "*" in row]
+    assert 20 < len(drawn) < 30
+    assert drawn[0].strip() == "*"  # the topmost corner
+    assert max(map(len, drawn)) > 50  # the two at the sides
+    assert len(drawn[-1].split()) == 2  # the two at the bottom
+
+
+@pytest.mark.virtual_time
+async def test_throughput(capsys: pytest.CaptureFixture[str]) -> None:
+    example = _example("throughput")
+    async with r2p.Module("PC1") as module, node_in(module) as node:
+        module.start(example["receive"])
+        publisher = node.advertise("benchmark", String)
+        for tick in range(30):
+            await publisher.publish(String("x" * 1000 * tick))
+            await asyncio.sleep(0.1)
+    assert "10 messages/s, 0.1 MB/s, lost 0" in capsys.readouterr().out.splitlines()
+    async with r2p.Module("PC2") as module, node_in(module) as node:
+        texts = node.subscribe("benchmark", String, queue=10)
+        module.start(example["transmit"])
+        assert len((await texts.fetch()).data) == 60
+        await asyncio.sleep(0)
+        module.parameters.set({("transmit", "size"): 500})
+        while len((await texts.fetch()).data) == 60:
+            pass
 
 
 @pytest.mark.virtual_time

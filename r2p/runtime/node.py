@@ -104,6 +104,8 @@ class Node:
         self._tickers: set[Ticker] = set()
         self._reminder: SpinReminder | None = None
         """A reminder from the first subscription with a callback until `spin` is called."""
+        self._spinning: asyncio.Future[None] | None = None
+        """What a `spin` waits for."""
         self._started = False
 
     @overload
@@ -243,8 +245,8 @@ class Node:
         subscriber: Subscriber[Any] = Subscriber(self._space, self, where, shape, options, accepted)
         self.subscribers[subscriber] = None
         subscriber.open()
-        if callback is not None and self._reminder is None:
-            self._reminder = SpinReminder(self.name, self.log, self.subscribers, self._space)
+        if callback is not None:
+            self._has_callback()
         return subscriber
 
     @overload
@@ -559,18 +561,27 @@ class Node:
             served |= await subscriber.serve()
         return served
 
+    def _has_callback(self) -> None:
+        """Let a `spin` that waits, as in a handler's subscription, go on with the new callback; else remind of it."""
+        if self._spinning is not None:
+            if not self._spinning.done():
+                self._spinning.set_result(None)
+        elif self._reminder is None:
+            self._reminder = SpinReminder(self.name, self.log, self.subscribers, self._space)
+
     async def _arrival(self) -> None:
-        """Wait for a message of a subscription with a callback."""
+        """Wait for a message of a subscription with a callback, or for one more of these."""
         subscribers = self._with_callback()
         works = self.services or any(isinstance(each, PeriodicPublisher) for each in self.publishers)
         if not subscribers and not works:
             raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")
-        waiter = self._space.loop.create_future()
+        waiter = self._spinning = self._space.loop.create_future()
         try:
             for subscriber in subscribers:
                 subscriber.wait_by(waiter)
             await waiter
         finally:
+            self._spinning = None
             for subscriber in subscribers:
                 subscriber.wait_no_more(waiter)
 

@@ -387,6 +387,29 @@ async def test_a_node_of_periodic_publishers_spins() -> None:
         assert publisher.sent == 10
 
 
+@pytest.mark.virtual_time
+async def test_a_spin_that_waits_serves_a_subscription_that_a_handler_makes(caplog: pytest.LogCaptureFixture) -> None:
+    got: list[int] = []
+
+    async def spinner(node: r2p.Node) -> None:
+        async def open_topic(_request: Led) -> Led:
+            node.subscribe("a", Led, lambda message: got.append(message.led))
+            return Led()
+
+        node.serve("open", Led, Led, open_topic)
+        while True:
+            await node.spin()
+
+    async with local() as module:
+        module.start(spinner)
+        node = module.start(hold)
+        await node.client("open", Led, Led).call(Led())
+        await node.advertise("a", Led).publish(led(7))
+        await asyncio.sleep(3.0)  # the reminder of a node that does not spin comes after two
+    assert got == [7]
+    assert "spin()" not in caplog.text
+
+
 # Links that can't carry a type
 
 
