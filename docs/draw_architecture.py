@@ -15,7 +15,16 @@ PICTURE = Path(__file__).parent / "assets" / "architecture.svg"
 
 LAYERS: dict[str, tuple[str, ...]] = {
     "Commands, test tools": ("tools", "testing"),
-    "Simulation, boot loader, ROS": ("sim", "sim.can", "sim.modules", "sim.physics", "sim.robots", "loader", "ros"),
+    "Simulation, boot loader, ROS": (
+        "sim",
+        "sim.can",
+        "sim.modules",
+        "sim.physics",
+        "sim.robots",
+        "loader",
+        "ros",
+        "ros.ros1",
+    ),
     "Modules": ("modules", "bus"),
     "Gateways": ("bridge",),
     "Links": ("transports", "transports.can", "transports.rtcan", "transports.zenoh"),
