@@ -93,7 +93,9 @@ $(LOWEST)/stamp: pyproject.toml
 	$(LOWEST)/bin/uv pip list --python $(LOWEST)/bin/python
 	touch $@
 
-# What the tests use of the system: installed for root, unpacked for others, else they say what they skip.
+# What the tests use of the system: installed for root, unpacked for others, else they say what they skip. Real ROS 2
+# takes 275 MB: it is installed with CI=1 or PEERS=1.
 .PHONY: system
 system: $(STAMP)
 	@$(BIN)/python -m tests.debian
+	@$(BIN)/python -m tests.ros.rclpy.install
