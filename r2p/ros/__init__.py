@@ -4,6 +4,8 @@ definitions   .msg, .srv and .action files; what ROS 1 computes from them
 hashes        the hashes of types in ROS 2
 classes       message classes of ROS types, and definitions of r2p's classes
 cdr           the serialisation of ROS 2; that of ROS 1 is r2p's own
+conversions   which types of r2p are which of ROS; `standard` and `reports` have the functions
+stamps        when what a message says was measured
 library       the definitions that come with ROS, and what the ends of a connection compare of a type
 source        Python source of message classes
 packages      packages for ROS with the types of r2p's classes

@@ -1,0 +1,169 @@
+"""Conversions between r2p's standard messages and ROS's: which types go together, and what one of the two lacks.
+
+    found = conversion(Battery, "sensor_msgs/BatteryState", 2)
+    for each in found.to_ros(message, stamp, sample.source):
+        data = cdr(found.theirs).encode(each)
+
+The mapping goes by the full names of the types (`r2p_msgs/Battery` and `sensor_msgs/BatteryState`), never by their
+fields: two types with the same numbers may mean different things. A class with the name of one of r2p's types, but
+other fields, is not converted.
+
+Types that are in `r2p.msg` as they are in ROS (LaserScan, JointState, Image, ...) need no conversion, nor do classes
+that a program has of other ROS types. Everything else travels as a type of its own, `r2p_msgs/Name`. `standard` has the
+functions for each pair, and `reports` those of logs and diagnostics.
+"""
+
+import functools
+from collections.abc import Callable
+
+import msgspec
+
+import r2p.msg as ours
+from r2p.messages import Message, layout
+from r2p.ros import reports, standard
+from r2p.ros.classes import RosTypes
+from r2p.ros.definitions import short_name
+from r2p.ros.library import definitions_of_ros
+from r2p.ros.standard import FromRos, Functions, RosParts, ToRos
+from r2p.ros.standard import RosNames as RosNames  # a parameter of `conversion`
+
+NO_NAMES = RosNames()
+
+
+class Conversion(msgspec.Struct, frozen=True):
+    """The conversion between a message class and a ROS type.
+
+    `theirs` is the ROS type as a class, whose bytes are those of ROS 1; for ROS 2 use `r2p.ros.cdr`. `to_ros` takes a
+    message, its stamp (UTC, ns) and its source, and returns one message or several. `lost_to_ros` and `lost_from_ros`
+    say in words what the other type lacks. Both functions raise MessageError for a message that it can't have.
+    """
+
+    ours: type[Message]
+    theirs: type[Message]
+    to_ros: ToRos
+    from_ros: FromRos
+    lost_to_ros: str
+    lost_from_ros: str
+
+
+class TypePair(msgspec.Struct, frozen=True):
+    """A row of the table: the names of ROS's type in ROS 1 and ROS 2, and what is lost, in words."""
+
+    ours: type[Message]
+    ros1: str
+    ros2: str
+    make: Callable[[RosParts], Functions]
+    lost_to_ros: str = ""
+    lost_from_ros: str = ""
+
+    def theirs(self, version: int) -> str:
+        """Return the name of ROS's type in this version."""
+        return self.ros1 if version == 1 else self.ros2
+
+
+def conversion(ours: type[Message], theirs: str, version: int, names: RosNames = NO_NAMES) -> Conversion | None:
+    """Return the conversion between a message class and a type of ROS 1 or 2, by its name; None if there is none.
+
+    Raises MessageError, which says what to install, if rosbags is missing, which has the definitions of ROS.
+    """
+    theirs = short_name(theirs)
+    found = next((pair for pair in _pairs_of(ours) if pair.theirs(version) == theirs), None)
+    if found is None:
+        return None
+    types = RosTypes(version, definitions_of_ros(theirs, version))
+    made = types.load(theirs)
+    to_ros, from_ros = found.make(RosParts(found.ours, types, made, version, names))
+    if ours is not found.ours:
+        from_ros = _into(ours, from_ros)
+    return Conversion(ours, made, to_ros, from_ros, found.lost_to_ros, found.lost_from_ros)
+
+
+def standard_type(ours: type[Message], version: int) -> str | None:
+    """Return the name of the ROS type that messages of a class become by default; None: one of their own."""
+    return next((pair.theirs(version) for pair in _pairs_of(ours)), None)
+
+
+def _pairs_of(cls: type[Message]) -> list[TypePair]:
+    shape = layout(cls)
+    return [pair for pair in _by_name().get(shape.name, []) if layout(pair.ours).schema == shape.schema]
+
+
+@functools.cache
+def _by_name() -> dict[str, list[TypePair]]:
+    found: dict[str, list[TypePair]] = {}
+    for pair in PAIRS:
+        found.setdefault(layout(pair.ours).name, []).append(pair)
+    return found
+
+
+def _into(cls: type[Message], from_ros: FromRos) -> FromRos:
+    """Return a function whose messages are of another class with the same fields, such as one made of a schema."""
+    return lambda message: cls.decode(from_ros(message).encode())
+
+
+_PLANE = "z, roll and pitch, and their rates"
+_NO_STAMP = "the stamp, which is that of the sample"
+_COVARIANCES = "covariances"
+_IMU = "nothing; no acceleration and no covariance are given"
+_FROM_IMU = "accelerations, covariances; without an orientation the angles are NaN"
+_ODOMETRY = "nothing; the covariances are 0, unknown"
+_GPS = "speed, course, number of satellites; the altitude stays that above mean sea level"
+_FROM_GPS = "covariances but for a dilution of precision, the service; speed and course are NaN"
+_ALL = "everything: there is no way back"
+
+
+def _in_both(cls: type[Message], theirs: str, make: Callable[[RosParts], Functions], to: str, back: str) -> TypePair:
+    return TypePair(cls, theirs, theirs, make, to, back)
+
+
+PAIRS = (
+    _in_both(ours.IMU, "sensor_msgs/Imu", standard.imu, _IMU, f"{_FROM_IMU}, {_NO_STAMP}"),
+    _in_both(ours.StampedIMU, "sensor_msgs/Imu", standard.imu, _IMU, _FROM_IMU),
+    _in_both(
+        ours.Odometry, "nav_msgs/Odometry", standard.odometry, _ODOMETRY, f"{_PLANE}, {_COVARIANCES}, {_NO_STAMP}"
+    ),
+    _in_both(ours.StampedOdometry, "nav_msgs/Odometry", standard.odometry, _ODOMETRY, f"{_PLANE}, {_COVARIANCES}"),
+    _in_both(ours.Velocity3, "geometry_msgs/Twist", standard.velocity, "", _PLANE),
+    _in_both(ours.Velocity3, "geometry_msgs/TwistStamped", standard.velocity, "", f"{_PLANE}, {_NO_STAMP}"),
+    _in_both(ours.StampedVelocity3, "geometry_msgs/TwistStamped", standard.velocity, "", _PLANE),
+    _in_both(ours.Pose3, "geometry_msgs/Pose", standard.pose, "", _PLANE),
+    _in_both(ours.Pose3, "geometry_msgs/PoseStamped", standard.pose, "", f"{_PLANE}, {_NO_STAMP}"),
+    _in_both(ours.StampedPose3, "geometry_msgs/PoseStamped", standard.pose, "", _PLANE),
+    _in_both(
+        ours.Battery,
+        "sensor_msgs/BatteryState",
+        standard.battery,
+        "the remaining time",
+        "temperature, capacities, cells, health, technology; a current that is not measured is 0",
+    ),
+    _in_both(
+        ours.Proximity,
+        "sensor_msgs/Range",
+        standard.proximity,
+        "nothing: four messages, in the frames `TOPIC_0` to `TOPIC_3`",
+        "field of view and limits; a frame's last digit says which of the four readings it is",
+    ),
+    _in_both(ours.GPS, "sensor_msgs/NavSatFix", standard.gps, _GPS, f"{_FROM_GPS}, {_NO_STAMP}"),
+    _in_both(ours.StampedGPS, "sensor_msgs/NavSatFix", standard.gps, _GPS, _FROM_GPS),
+    _in_both(
+        ours.Pressure,
+        "sensor_msgs/FluidPressure",
+        standard.pressure,
+        "the altitude",
+        f"variance, {_NO_STAMP}; the altitude is computed by the standard atmosphere",
+    ),
+    TypePair(
+        ours.Log,
+        "rosgraph_msgs/Log",
+        "rcl_interfaces/Log",
+        reports.log,
+        "nothing; there is no file, function or line",
+        "file, function, line; texts over 128 characters, names over 7 and 8, and characters beyond ASCII",
+    ),
+    _in_both(ours.GatewayStatus, "diagnostic_msgs/DiagnosticArray", reports.gateway_status, "", _ALL),
+    _in_both(ours.PowerEvent, "diagnostic_msgs/DiagnosticArray", reports.power_event, "which were crossed", _ALL),
+    _in_both(ours.BusTraffic, "diagnostic_msgs/DiagnosticArray", reports.bus_traffic, "", _ALL),
+    _in_both(ours.Float32, "std_msgs/Float32", standard.number, "", ""),
+    _in_both(ours.Text, "std_msgs/String", standard.text, "", "texts over 64 characters, characters beyond ASCII"),
+)
+"""All pairs; the first one of a class is its standard type."""
