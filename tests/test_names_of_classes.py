@@ -15,8 +15,10 @@ FUNCTION_LINES = 60
 
 
 def is_message(path: str, node: ast.ClassDef) -> bool:
-    """Whether a class is named by the wire, or by the robots that send it."""
+    """Whether a class is named by the wire, or by the robots that send it, or is a part of a service."""
     bases = {ast.unparse(base) for base in node.bases}
+    if node.name in ("Request", "Response"):
+        return "Message" in bases
     return path.startswith(("r2p/msg.py", "r2p/codecs/")) and not bases.isdisjoint({"Message", "msgspec.Struct"})
 
 

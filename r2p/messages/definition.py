@@ -14,7 +14,8 @@ import msgspec
 from r2p.errors import MessageError
 from r2p.messages.shapes import show
 
-_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
+TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(?:(?:srv|action)/)?[A-Za-z][A-Za-z0-9_]*")
+"""A full name of a type; that of a part of a service or action of ROS 2 has its kind in the middle."""
 _REQUIRED = re.compile(r"Required field '(\w+)' cannot follow optional fields")
 _OPTION = re.compile(r"(?=.*keyword argument).*'(\w+)'")  # Python's text depends on its version
 _ARGUMENTS = re.compile(
@@ -33,7 +34,7 @@ class MessageMeta(msgspec.StructMeta):
     def __new__(mcls, name: str, bases: tuple[type, ...], members: dict[str, Any], /, **options: Any) -> "MessageMeta":
         """Make the class of a `class` statement; the option `name` is the full name of the type."""
         full_name = options.pop("name", "")
-        if full_name and not _TYPE_NAME.fullmatch(str(full_name)):
+        if full_name and not TYPE_NAME.fullmatch(str(full_name)):
             raise MessageError(f"{name}: {full_name!r} is not the full name of a type, such as sensor_msgs/LaserScan")
         try:
             cls = super().__new__(mcls, name, bases, members, **options)
@@ -46,6 +47,10 @@ class MessageMeta(msgspec.StructMeta):
         if cls.__struct_config__.frozen:  # msgspec's own methods, set in each class, do not say what to write
             cls.__setattr__ = cls.__delattr__ = _refuse_assignment  # type: ignore[assignment, method-assign]
         return cls
+
+    def give_name(cls, full_name: str) -> None:
+        """Set the full name of a class that has none; before its layout is made."""
+        cls._name = cls._name or full_name
 
     def __setattr__(cls, name: str, value: object) -> None:
         """Refuse what the decorator `dataclass` sets first; its own error would say `readonly attribute`."""

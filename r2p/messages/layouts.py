@@ -168,7 +168,7 @@ def check_field_name(path: str, name: str) -> None:
         )
 
 
-def _full_name(cls: type[Message]) -> str:
+def full_name(cls: type) -> str:
     """Return the name that was given, else package and class; of a program that is run as a file, the file's name."""
     if own := vars(cls).get("_name"):
         return str(own)
@@ -212,7 +212,7 @@ def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
             f"{cls.__name__} can't be all zero, which any module may send: {error}; accept it in __post_init__"
         ) from error
     schema = " ".join(leaf for field in fields for leaf in _leaves(field.shape, field.wire_name))
-    return Layout(cls, _full_name(cls), fields, size, size_min, varies, schema, fingerprint_of(schema), packing)
+    return Layout(cls, full_name(cls), fields, size, size_min, varies, schema, fingerprint_of(schema), packing)
 
 
 def _hints(cls: type[Message]) -> dict[str, Any]:

@@ -9,4 +9,10 @@ stamps        when what a message says was measured
 library       the definitions that come with ROS, and what the ends of a connection compare of a type
 source        Python source of message classes
 packages      packages for ROS with the types of r2p's classes
+service_types   types of services in ROS; std_srvs: those that every ROS has
+action_types    types of actions
 """
+
+from r2p.ros.action_types import Action
+
+__all__ = ["Action"]

@@ -13,7 +13,7 @@ from typing import Any
 
 from r2p.errors import MessageError
 from r2p.messages import Message, layout
-from r2p.ros.classes import RosTypes, definitions_of
+from r2p.ros.classes import HEADER, RosTypes, definitions_of
 from r2p.ros.definitions import Definitions, MessageDefinition, md5, parse, parse_action, parse_service, short_name
 from r2p.ros.hashes import TypeDescriptions
 from r2p.ros.packages import OF_ROS
@@ -130,9 +130,21 @@ def _definitions(cls: type[Message], version: int) -> Definitions:
     """
     shape = layout(cls)
     if shape.name.partition("/")[0] not in OF_ROS:
-        return definitions_of(cls, version)
+        return definitions_with_those_of_ros(cls, version)
     found = definitions_of_ros(shape.name, version)
     theirs = layout(RosTypes(version, found).load(shape.name))
     if theirs.schema != shape.schema:
         raise MessageError(f"{shape.name} of ROS {version} has other fields than {cls.__name__}")
+    return found
+
+
+def definitions_with_those_of_ros(cls: type[Message], version: int) -> dict[str, MessageDefinition]:
+    """Return the definitions of a class and of all classes in it; of a nested type that comes with ROS, its own one.
+
+    Raises MessageError as `ros1_md5` does.
+    """
+    found = definitions_of(cls, version)
+    for name in [each for each in found if each not in (layout(cls).name, HEADER)]:
+        if name.partition("/")[0] in OF_ROS and short_name(name).replace("/", "/msg/") in _store(version).types:
+            found |= definitions_of_ros(name, version)
     return found

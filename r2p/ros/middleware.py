@@ -30,6 +30,8 @@ class Qos(msgspec.Struct, frozen=True):
 class RosType(msgspec.Struct, frozen=True):
     """A type as the ends of a connection compare it: `name` (`sensor_msgs/Imu`), and `checksum`: md5 or RIHS01.
 
+    The name of a part of an action has its kind in the middle: `test_msgs/action/Fibonacci_FeedbackMessage`.
+
     `definition` is the text of the type and of those in it, as in the header of a connection of ROS 1.
     """
 
@@ -39,7 +41,10 @@ class RosType(msgspec.Struct, frozen=True):
 
 
 class RosService(msgspec.Struct, frozen=True):
-    """The type of a service: `name` (`std_srvs/SetBool`), and `checksum`: md5 or RIHS01."""
+    """The type of a service: `name` (`std_srvs/SetBool`), and `checksum`: md5 or RIHS01.
+
+    The name of a service of an action has its kind in the middle: `test_msgs/action/Fibonacci_SendGoal`.
+    """
 
     name: str
     checksum: str
@@ -112,6 +117,8 @@ Answer = Callable[[bytes], None]
 """Answers a request, with the serialised response."""
 Refuse = Callable[[str], None]
 """Answers a request with the text of an error."""
+Cancel = Callable[[], None]
+"""Cancels a request whose caller is gone; does nothing once it is answered."""
 
 
 class MiddlewareUser(Protocol):
@@ -144,8 +151,12 @@ class MiddlewareUser(Protocol):
     def received(self, messages: list[RosArrival]) -> None:
         """Deliver messages that arrived, in order."""
 
-    def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> None:
-        """Handle a request for a server of the link; `caller` is the other node, or empty."""
+    def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
+        """Handle a request for a server of the link; `caller` is the other node, or empty.
+
+        One of `answer` and `refuse` is called, once, perhaps before this returns; neither after the returned function
+        was, which cancels the request: its caller is gone.
+        """
 
     def made_room(self) -> None:
         """Go on sending: `Middleware.full` was true, and is not any more."""

@@ -13,10 +13,11 @@ from r2p.ros.classes import definitions_of
 from r2p.ros.definitions import MessageDefinition
 
 OF_ROS = frozenset(
-    f"{name}_msgs"
-    for name in (
-        *("actionlib", "diagnostic", "geometry", "nav", "rosgraph", "sensor", "shape", "std", "stereo", "tf2"),
-        *("trajectory", "visualization"),
+    (
+        *("builtin_interfaces", "rcl_interfaces", "rosgraph_msgs", "std_srvs", "type_description_interfaces"),
+        *("action_msgs", "actionlib_msgs", "diagnostic_msgs", "geometry_msgs", "lifecycle_msgs", "nav_msgs"),
+        *("sensor_msgs", "shape_msgs", "std_msgs", "stereo_msgs", "tf2_msgs", "trajectory_msgs"),
+        *("unique_identifier_msgs", "visualization_msgs"),
     )
 )
 """Packages that come with ROS, which are left out."""

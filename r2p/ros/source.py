@@ -43,6 +43,20 @@ def source(classes: Iterable[type[Message]], definitions: Definitions, bound: in
     return writer.text()
 
 
+PARTS = {
+    ".srv": ("r2p.Service", ("Request", "Response")),
+    ".action": ("r2p.ros.Action", ("Goal", "Result", "Feedback")),
+}
+"""What the file of a service or action becomes: a class with this base, which holds the classes of the parts."""
+
+
+def source_of_parts(suffix: str, classes: list[type[Message]], definitions: Definitions, bound: int) -> str:
+    """Return the source of a service or action (`suffix` of its file) of the classes of its parts, as `source` does."""
+    writer = _ClassWriter(definitions, bound)
+    writer.add_parts(*PARTS[suffix], [layout(cls) for cls in classes])
+    return writer.text()
+
+
 class _ClassWriter:
     """Writes classes, each once, and collects what has to be imported for them."""
 
@@ -52,11 +66,12 @@ class _ClassWriter:
         self._classes: dict[str, str] = {}
         self._typing: set[str] = set()
         self._standard: set[str] = set()
+        self._imports = ["import r2p"]
 
     def text(self) -> str:
         """Return the whole source."""
         lines = [f"from typing import {', '.join(sorted(self._typing))}\n"] if self._typing else []
-        lines.append("import r2p")
+        lines += self._imports
         if self._standard:
             lines.append(f"from r2p.msg import {', '.join(sorted(self._standard))}")
         return "\n".join(lines) + "".join(f"\n\n\n{each}" for each in self._classes.values()) + "\n"
@@ -65,13 +80,30 @@ class _ClassWriter:
         """Write a class, after those that it needs."""
         if shape.name in self._classes or self._is_standard(shape.cls):
             return
+        self._classes[shape.name] = self._class(shape)
+
+    def _class(self, shape: Layout[Any]) -> str:
+        """Return the source of a class, after those that it needs are written."""
         fields = [self._field(field) for field in shape.fields]
         definition = self._definitions.get(shape.name, MessageDefinition(shape.name, ()))
         constants = [self._constant(each) for each in definition.constants]
         lines = [f'class {shape.cls.__name__}(r2p.Message, name="{shape.name}"):']
         lines += [f'    """{_summary(definition)}"""', ""]
         lines += [f"    {each}" for each in [*constants, *fields]]
-        self._classes[shape.name] = "\n".join(lines).rstrip()
+        return "\n".join(lines).rstrip()
+
+    def add_parts(self, base: str, parts: tuple[str, ...], shapes: list[Layout[Any]]) -> None:
+        """Write the class of a service or action, with the classes of its parts nested in it."""
+        name = shapes[0].name.removesuffix(parts[0]).removesuffix("_")
+        lines = [f'class {name.partition("/")[2]}({base}, name="{name}"):', f'    """{name} of ROS."""']
+        for part, shape in zip(parts, shapes, strict=True):
+            body = (
+                self._class(shape).replace(f'"""{shape.name} of ROS."""', f'"""The {part.lower()}."""').split("\n")[1:]
+            )
+            lines += ["", f"    class {part}(r2p.Message):", *(f"    {line}".rstrip() for line in body)]
+        if base.startswith("r2p.ros"):
+            self._imports.append("import r2p.ros")
+        self._classes[name] = "\n".join(lines)
 
     def _is_standard(self, cls: type[Message]) -> bool:
         if cls in TIMES.values():

@@ -14,6 +14,7 @@ import msgspec
 from r2p.codecs.services import HEADER_SIZE, REQUESTS, RESPONSES
 from r2p.errors import MessageError
 from r2p.messages import Layout, Message, layout, show, u8, u16, u32
+from r2p.messages.definition import TYPE_NAME, MessageMeta
 
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
@@ -40,7 +41,27 @@ class Service:
                 offset: r2p.f32 = 0.0
 
     The class stands for both types in `Node.service`, `Node.serve` and `Node.client`, and after --type.
+    `class Calibrate(r2p.Service, name="arm_msgs/Calibrate")` gives the type another name than that of package and
+    class, as ROS compares it.
     """
+
+    def __init_subclass__(cls, name: str = "", **options: Any) -> None:
+        """Name the nested classes after the service. Raises MessageError for what is not a full name."""
+        super().__init_subclass__(**options)
+        if not name:
+            return
+        if not TYPE_NAME.fullmatch(name):
+            raise MessageError(f"{cls.__name__}: {name!r} is not the full name of a service, such as std_srvs/SetBool")
+        full_name = name if name.count("/") > 1 else name.replace("/", "/srv/")
+        for part in ("Request", "Response"):
+            name_nested(cls, part, f"{full_name}_{part}")
+
+
+def name_nested(outer: type, part: str, full_name: str) -> None:
+    """Give a message class that is defined in another class this name, if it has none of its own."""
+    found = vars(outer).get(part)
+    if isinstance(found, MessageMeta) and found.__qualname__ == f"{outer.__qualname__}.{part}":
+        found.give_name(full_name)
 
 
 class ServiceType(Protocol[Q_co, R_co]):
@@ -105,8 +126,11 @@ def _nested(name: str, service: Any, part: str) -> type[Message]:
 
 def _topic_layout(body: Layout[Any], end: str, field: str) -> Layout[Any]:
     """Return the layout of a topic of the pair: the header, then one field, after whose type it is named."""
-    path = body.cls.__qualname__.rpartition("<locals>.")[2]  # with the classes that it is nested in
-    name, package = path.replace(".", "_") + end, body.name.partition("/")[0]
-    full_name = f"{re.sub(_NOT_IN_NAMES, '', package) or 'r2p'}/{re.sub(_NOT_IN_NAMES, '', name)}"
+    package, *kind, name = body.name.split("/")
+    if not kind:  # not named as a part of a service: with the classes that it is nested in
+        name = body.cls.__qualname__.rpartition("<locals>.")[2].replace(".", "_")
+    name += end
+    package = re.sub(_NOT_IN_NAMES, "", package) or "r2p"
+    full_name = "/".join([package, *(each for each in kind if each == "action"), re.sub(_NOT_IN_NAMES, "", name)])
     members = {"__annotations__": dict([*_HEADER, (field, body.cls)]), "__module__": __name__}
     return layout(types.new_class(name, (Message,), {"name": full_name}, lambda space: space.update(members)))

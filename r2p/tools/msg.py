@@ -177,16 +177,19 @@ async def import_(
     from r2p.ros.classes import RosTypes
     from r2p.ros.definitions import short_name
     from r2p.ros.library import DefinitionFile, definitions_of_ros
-    from r2p.ros.source import source
+    from r2p.ros.source import PARTS, source, source_of_parts
 
     version = 1 if ros1 else 2
+    suffix = Path(type).suffix
     try:
-        if Path(type).suffix in (".msg", ".srv", ".action"):
+        if suffix in (".msg", *PARTS):
             names, definitions = DefinitionFile(Path(type)).read(version)
         else:
             names, definitions = [short_name(type)], definitions_of_ros(type, version)
         types = RosTypes(version, definitions)
-        typer.echo(source([types.load(name) for name in names], definitions, bound), nl=False)
+        classes = [types.load(name) for name in names]
+        text = source_of_parts(suffix, classes, definitions, bound) if suffix in PARTS else ""
+        typer.echo(text or source(classes, definitions, bound), nl=False)
     except r2p.MessageError as error:
         raise UsageError(str(error)) from error
 

@@ -1,0 +1,70 @@
+"""Types of services in ROS, made of the types of the two topics that a service of r2p is.
+
+    Calibrate(r2p.Service, name="arm_msgs/Calibrate")
+    topics    arm_msgs/Calibrate_Request_q, arm_msgs/Calibrate_Response_r      the header, then request or response
+    ROS       arm_msgs/Calibrate, its md5 of both parts (ROS 1) or the hash of arm_msgs/srv/Calibrate (ROS 2)
+
+A service without a class of its own is named after the type of its requests. Those of an action have their kind in the
+name, as `test_msgs/action/Fibonacci_SendGoal`.
+"""
+
+from typing import Any
+
+import msgspec
+
+from r2p.codecs.services import HEADER_SIZE, REQUESTS
+from r2p.errors import MessageError
+from r2p.messages import Layout, Message, Nested, layout, show
+from r2p.ros.definitions import service_md5
+from r2p.ros.hashes import TypeDescriptions
+from r2p.ros.library import definitions_with_those_of_ros
+from r2p.ros.middleware import RosService
+
+
+class _Nothing(Message, name="std_srvs/srv/Empty_Request"):
+    """A request or response without fields."""
+
+
+class ServiceShape(msgspec.Struct, frozen=True, eq=False):
+    """A service: the name of its type, the layouts of request and response, and those of its two topics."""
+
+    name: str
+    request: Layout[Any]
+    response: Layout[Any]
+    requests: Layout[Any]
+    responses: Layout[Any]
+
+
+def service_shape(requests: Layout[Any], responses: Layout[Any]) -> ServiceShape:
+    """Return the service of which these are the layouts of the topics NAME_q and NAME_r.
+
+    They may be learnt from another module, with made-up names inside. Raises MessageError if they are not of a service.
+    """
+    name = requests.name.removesuffix(REQUESTS).removesuffix("Request").removesuffix("_")
+    return ServiceShape(name, _body(requests), _body(responses), requests, responses)
+
+
+def _body(topic: Layout[Any]) -> Layout[Any]:
+    """Return the layout of the one field behind the header; a schema does not show one without fields."""
+    last = topic.fields[-1] if topic.fields else None
+    if last is not None and isinstance(last.shape, Nested):
+        return last.shape.layout
+    if topic.exact_size == HEADER_SIZE:
+        return layout(_Nothing)
+    raise MessageError(f"{show(topic.name)} is not the type of a service's topic")
+
+
+def service_type(shape: ServiceShape, version: int) -> RosService:
+    """Return the type of a service in ROS 1 or 2 (`version`). Raises MessageError for types that ROS can't define."""
+    request, response = shape.request, shape.response
+    found = definitions_with_those_of_ros(request.cls, version) | definitions_with_those_of_ros(response.cls, version)
+    if version == 1:
+        return RosService(shape.name, service_md5(request.name, response.name, found))
+    types, full_name = TypeDescriptions(found), ros2_service_name(shape.name)
+    types.add_service(full_name, found[request.name].fields, found[response.name].fields)
+    return RosService(shape.name, types.hash(full_name))
+
+
+def ros2_service_name(name: str) -> str:
+    """Return the name of a service's type as ROS 2 writes it: `std_srvs/srv/SetBool`."""
+    return name if name.count("/") > 1 else name.replace("/", "/srv/")
