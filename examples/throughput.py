@@ -14,15 +14,18 @@ from r2p.msg import String
 
 async def transmit(node: r2p.Node) -> None:
     size = node.parameter("size", 60, min=0, max=65_000, unit="B")
+    rate = node.parameter("rate", 0, min=0, unit="Hz", doc="0: as many as are taken")
     publisher = node.advertise("benchmark", String)
     await publisher.wait_subscriber()
-    message, length = String("x" * size.value), size.value
+    message = String()
     while True:
-        if length != size.value:
-            message, length = String("x" * size.value), size.value
+        if len(message.data) != size.value:
+            message = String("x" * size.value)
         await publisher.publish(message)
-        if publisher.sent % 100 == 0:
-            await asyncio.sleep(0)  # publishing waits only for room: let others run
+        if rate.value:
+            await asyncio.sleep(1 / rate.value)
+        elif publisher.sent % 100 == 0:
+            await asyncio.sleep(0)  # publishing waits only for room: let other tasks run
 
 
 async def receive(node: r2p.Node) -> None:

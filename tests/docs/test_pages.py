@@ -12,6 +12,7 @@ import can
 import pytest
 
 import r2p
+import r2p.ros
 from benchmarks.__main__ import ALL
 from r2p.msg import Led
 from r2p.tools import main
@@ -92,7 +93,7 @@ def test_what_the_page_on_python_can_says_of_it() -> None:
 @pytest.mark.parametrize("page", sorted((DOCS / "coming-from").glob("*.md")), ids=lambda page: page.stem)
 async def test_our_side_of_the_tables_exists(page: Path) -> None:
     """Attributes of what a program holds, and names of the package."""
-    ours = "\n".join(call for _, call in _rows(page, "rclpy", "rospy", "pycyphal", "python-can"))
+    ours = "\n".join(call for _, call in _rows(page, "rclpy", "rospy", "uROSnode", "pycyphal", "python-can"))
     async with r2p.Module("PC1", via="memory:lab") as module:
         node = module.start(_idle)
         subscriber = node.subscribe("leds", Led)
