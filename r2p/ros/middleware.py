@@ -128,7 +128,10 @@ class MiddlewareUser(Protocol):
         """Note that the network works (again): the master answers, the router is connected."""
 
     def middleware_down(self, reason: str) -> None:
-        """Note that the network is gone, and why; the middleware goes on trying."""
+        """Note that the network is gone, and why; the middleware goes on trying.
+
+        Subscribers, publishers and the graph count as gone with it, and are reported again after `middleware_up`.
+        """
 
     def middleware_waits(self, reason: str) -> None:
         """Note that the network can't be reached yet, and why."""
@@ -142,8 +145,11 @@ class MiddlewareUser(Protocol):
     def subscribers_gone(self, topic: str) -> None:
         """Note that the topic's last remote subscriber is gone."""
 
-    def publisher_found(self, topic: str, node: str, type_name: str, definition: str) -> None:
-        """Note that messages of this publisher arrive from now on; the definition is empty where it is unknown."""
+    def publisher_found(self, topic: str, node: str, type_name: str, definition: str, *, latched: bool = False) -> None:
+        """Note that messages of this publisher arrive from now on; the definition is empty where it is unknown.
+
+        `latched`: its last message is sent to each new subscriber.
+        """
 
     def publisher_gone(self, topic: str, node: str) -> None:
         """Note that no more messages come from this node's publisher."""

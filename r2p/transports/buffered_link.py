@@ -102,7 +102,7 @@ class BufferedLink(Link):
 
     @abc.abstractmethod
     def sample(self, topic: str, arrival: Any) -> Sample:
-        """Make a sample of a received message."""
+        """Make a sample of a received message. Raises DecodeError for one that can't be, which is counted."""
 
     def has_room_for(self, sample: Sample) -> bool:
         """Return whether there is room for this very sample now; called before each `write`."""
@@ -284,6 +284,8 @@ class BufferedLink(Link):
                     if blocked is not None and self._backpressure.wait(sample, blocked):
                         self._pause_reading()
                         return
+            except DecodeError:
+                lost["undecodable"] += 1
             except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
                 lost.internal_error(error)
         self._space.loop.call_soon(self._deliver)
