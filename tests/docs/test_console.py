@@ -10,11 +10,13 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
+from tests.docs import ros1
 from tests.docs.blocks import ROOT, Block, of_page, pages, pattern
 from tests.docs.shell import Command, Process, commands
 from tests.ports import free_port
@@ -43,12 +45,15 @@ def emulated_board() -> Iterator[dict[str, str]]:
 class Session:
     """One page: its directory, its environment, and the commands that still run."""
 
-    def __init__(self, directory: Path, replacements: dict[str, str]) -> None:
+    def __init__(
+        self, directory: Path, replacements: dict[str, str], environment: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
         binaries = Path(sys.executable).parent
         self._directory = directory
         self._replacements = replacements
         self._environment = {
-            "PATH": f"{binaries}:{os.environ['PATH']}",
+            **environment,
+            "PATH": f"{environment.get('PATH', '')}{binaries}:{os.environ['PATH']}",
             "HOME": str(directory),
             "TERM": "dumb",
             "COLUMNS": "200",
@@ -125,9 +130,10 @@ def test_the_commands_print_what_the_page_shows(page: Path, tmp_path: Path) -> N
     with contextlib.ExitStack() as stack:
         if any(known in block.text for block in todo for known in (ROBOT, DEVICE)):
             replacements |= stack.enter_context(emulated_board())
+        environment = stack.enter_context(ros1.network(tmp_path / "ros1")) if ros1.is_needed(todo) else {}
         for example in (ROOT / "examples").glob("*.py"):
             (tmp_path / example.name).write_text(example.read_text())
-        session = Session(tmp_path, replacements)
+        session = Session(tmp_path, replacements, environment)
         stack.callback(session.close)
         for block in todo:
             session.play(block)
