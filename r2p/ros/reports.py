@@ -10,7 +10,7 @@ from typing import Any
 from r2p.errors import MessageError
 from r2p.messages import Message, Timestamp
 from r2p.msg import PowerEvent
-from r2p.names import MODULE_FIELD, NODE_FIELD, module_alias, node_alias
+from r2p.names import module_alias, node_alias
 from r2p.ros.standard import FromRos, Functions, RosNames, RosParts, ToRos, ascii_text, header
 from r2p.runtime.sample import Source
 
@@ -75,13 +75,11 @@ def _log_from_ros(parts: RosParts) -> FromRos:
 
 
 def owner_of(name: str, namespace: str = "") -> tuple[str, str]:
-    """Return the module and node of a Log for a node's name in ROS: its last two parts, or a module alone."""
+    """Return the module and node of a Log for a node's name in ROS: `/talker` is node talker of module talker."""
     path = ascii_text(name, len(name)).replace(".", "/").strip("/")
     inner = path.removeprefix(f"{namespace.strip('/')}/")
     before, _, last = inner.rpartition("/")
-    if not before:
-        return module_alias(last)[:MODULE_FIELD], ""
-    return module_alias(before.rpartition("/")[2])[:MODULE_FIELD], node_alias(last)[:NODE_FIELD]
+    return module_alias(before.rpartition("/")[2] or last), node_alias(last)
 
 
 # Diagnostics

@@ -58,7 +58,7 @@ def with_header_stamp(message: Any, ns: int) -> Any:
 
 
 class StampSource:
-    """Finds the stamp of each message of a type on its way to ROS; `counts` has STAMP_OF_RECEPTION."""
+    """Finds the stamps of messages of a type on their way to ROS; STAMP_OF_RECEPTION is counted in `counts`."""
 
     def __init__(self, cls: type[Message], counts: Counter[str]) -> None:
         self._counts = counts
