@@ -39,6 +39,10 @@ _MARK_EVERY = SECOND // 2
 """Ns after which everything in the graph is marked as heard once more."""
 
 
+_CLIENTS = "clients"
+"""The source of demand by ROS nodes that call services."""
+
+
 class RosDiscovery(DiscoveryProtocol):
     """The discovery of one module on a ROS network; `review(topic)` is called after changes of its own topics."""
 
@@ -167,6 +171,13 @@ class RosDiscovery(DiscoveryProtocol):
             return [PublisherFound(topic, None, NO_PARAMS, 0)]
         self._found.remove(topic)
         return [PublisherGone(topic, None)]
+
+    def set_demand(self, topic: str, role: int, *, wanted: bool) -> None:
+        """Note that ROS nodes may publish or subscribe to a topic, though the graph does not show it: clients."""
+        if wanted:
+            self._demand.add(topic, role, _CLIENTS)
+        else:
+            self._demand.remove(topic, role, _CLIENTS)
 
     def set_type(self, topic: str, known: TopicType) -> None:
         """Enter the type here of a topic that ROS nodes have."""

@@ -32,6 +32,7 @@ from r2p.ros.middleware import (
 )
 from r2p.ros.options import RosOptions, lookup
 from r2p.ros.registrations import Registrations
+from r2p.ros.services import RosServices, ServiceArrival
 from r2p.ros.topics import GraphNames, RosTopic, TopicTypes, is_own, is_service
 from r2p.runtime.sample import Sample, Source
 from r2p.runtime.topic import Topic
@@ -71,6 +72,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.off_ros: dict[str, str] = {}
         """The topics that are not on the ROS network, and why."""
         self._registrations = Registrations(middleware, self.names.node(hub.space.module))
+        self.services = RosServices(self, hub, self._ros, self._registrations)
         self._published: dict[str, _Published] = {}
         self._subscribed: dict[str, RosTopic] = {}
         self._by_ros_name: dict[str, str] = {}
@@ -80,6 +82,9 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def _review(self, topic: str) -> None:
         """Register a topic as it is now used, or remove it."""
+        if self._is_service(topic):
+            self._apply(self.services.review(topic))
+            return
         name, travel, reason = self.names.to_ros(topic), None, ""
         publishes, subscribes = (topic, ROLE_PUBLISHES) in self._ros.own, (topic, ROLE_SUBSCRIBES) in self._ros.own
         if publishes or subscribes:
@@ -97,12 +102,16 @@ class RosLink(BufferedLink, MiddlewareUser):
         shape = travel.shape
         self._ros.set_type(topic, TopicType(shape.size, shape.fingerprint, shape.varies))
 
+    def _is_service(self, topic: str) -> bool:
+        known = self._space.topics.get(topic)
+        return is_service(topic, None if known is None else known.layout)
+
     def _travel(self, topic: str, name: str | None) -> tuple[RosTopic | None, str]:
         """Return how a topic travels, or why it does not; it need not be said of r2p's own topics."""
         known = self._space.topics.get(topic)
         shape = None if known is None else known.layout
         asked = lookup(self.options.types, topic) or lookup(self.options.ros_types, topic)
-        if is_service(topic, shape) or (is_own(topic) and not asked):
+        if is_own(topic) and not asked:
             return None, ""
         if name is None:
             return None, "ROS has no such names: each part begins with a letter, and all have at most 240 characters"
@@ -179,6 +188,9 @@ class RosLink(BufferedLink, MiddlewareUser):
     def write(self, topic: str, sample: Sample) -> None:
         published = self._published.get(topic)
         if published is None:
+            if topic in self.services:
+                self.services.write(topic, sample)
+                return
             self.stats.lost["not on ROS"] += 1
             return
         try:
@@ -192,6 +204,10 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.stats.sent += 1
         self.stats.bytes_sent += len(data)
         self.middleware.publish(node, published.name, data, sample.stamp)
+
+    def close(self) -> None:
+        self.services.close()
+        super().close()
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         """Do nothing: ROS nodes have no use for it."""
@@ -207,7 +223,9 @@ class RosLink(BufferedLink, MiddlewareUser):
     def add_publisher(self, topic: Topic, size: int, source: Hashable) -> None:
         super().add_publisher(topic, 0, source)  # the size here is another one than in ROS
 
-    def sample(self, topic: str, arrival: RosArrival) -> Sample:
+    def sample(self, topic: str, arrival: RosArrival | ServiceArrival) -> Sample:
+        if isinstance(arrival, ServiceArrival):
+            return self.services.sample(arrival)
         data, message = self._subscribed[topic].decode(arrival.data)
         self.stats.bytes_received += len(arrival.data)
         stamp = arrival.stamp
@@ -242,6 +260,7 @@ class RosLink(BufferedLink, MiddlewareUser):
             self.on_up()
 
     def middleware_down(self, reason: str) -> None:
+        self.services.graph_with_services(RosGraph())
         self.on_down(reason)
 
     def middleware_waits(self, reason: str) -> None:
@@ -249,7 +268,8 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def graph_changed(self, graph: RosGraph) -> None:
         if self.up:
-            self._apply(self._ros.graph_changed(self._clock.monotonic(), graph))
+            shown = self.services.graph_with_services(graph)
+            self._apply(self._ros.graph_changed(self._clock.monotonic(), shown))
 
     def subscriber_joined(self, topic: str) -> None:
         if (name := self._by_ros_name.get(topic)) is not None:
@@ -272,8 +292,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.receive(messages)
 
     def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
-        refuse(f"{service} is not served here")
-        return lambda: None
+        return self.services.requested(service, request, answer, refuse)
 
     def parameter_changed(self, key: str, value: object) -> None:
         """Do nothing yet."""

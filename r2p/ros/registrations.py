@@ -1,10 +1,29 @@
-"""What a link has registered at its middleware: ROS nodes, publishers and subscribers, by the topics of this side."""
+"""What a link has registered at its middleware: ROS nodes, publishers and subscribers, by the topics of this side, and
+servers, by the services.
+"""
 
 from collections import Counter
+from collections.abc import Callable, Collection
+from typing import Any, TypeAlias
 
-from r2p.codecs.management import ROLE_PUBLISHES
+import msgspec
+
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.discovery.directory import decrement
-from r2p.ros.middleware import Middleware, RosEndpoint
+from r2p.ros.middleware import Middleware, RosEndpoint, RosServer
+
+SERVES, CALLS = "serves", "calls"
+"""The roles of a node in a service, beside ROLE_PUBLISHES and ROLE_SUBSCRIBES in a topic."""
+
+
+class RosClient(msgspec.Struct, frozen=True):
+    """A client of a service in one of the link's ROS nodes: the node is shown, each call names it."""
+
+    node: str
+    service: str
+
+
+Registered: TypeAlias = RosEndpoint | RosServer | RosClient
 
 
 class Registrations:
@@ -20,34 +39,43 @@ class Registrations:
         """The ROS nodes of this link."""
         self._middleware = middleware
         self._keep_module_node = keep_module_node
-        self._endpoints: dict[tuple[str, int], set[RosEndpoint]] = {}
+        self._methods: dict[int | str, tuple[Callable[[Any], object], Callable[[Any], object]]] = {
+            ROLE_PUBLISHES: (middleware.advertise, middleware.withdraw),
+            ROLE_SUBSCRIBES: (middleware.subscribe, middleware.unsubscribe),
+            SERVES: (middleware.serve, middleware.unserve),
+            CALLS: (_do_nothing, _do_nothing),
+        }
+        self._endpoints: dict[tuple[str, int | str], set[Registered]] = {}
         self._counts: Counter[str] = Counter()
         self._refused: set[str] = set()
         self._add_nodes()
 
-    def declare(self, topic: str, role: int, endpoints: set[RosEndpoint]) -> None:
-        """Have these endpoints of a topic in a role, and no others. New ones come first: no node ends in between."""
-        endpoints = {each for each in endpoints if each.node not in self._refused}
-        before = self._endpoints.get((topic, role), set())
-        new, gone = _sorted(endpoints - before), _sorted(before - endpoints)
+    def declare(self, name: str, role: int | str, endpoints: Collection[Registered]) -> None:
+        """Have these endpoints of a topic or service in a role, and no others. New ones come first: no node ends in
+        between.
+        """
+        wanted = {each for each in endpoints if each.node not in self._refused}
+        before = self._endpoints.get((name, role), set())
+        new, gone = _sorted(wanted - before), _sorted(before - wanted)
         self._counts.update(each.node for each in new)
         self._add_nodes()
+        register, unregister = self._methods[role]
         for endpoint in new:
-            (self._middleware.advertise if role == ROLE_PUBLISHES else self._middleware.subscribe)(endpoint)
+            register(endpoint)
         for endpoint in gone:
-            (self._middleware.withdraw if role == ROLE_PUBLISHES else self._middleware.unsubscribe)(endpoint)
+            unregister(endpoint)
             decrement(self._counts, endpoint.node)
         self._remove_nodes()
-        if endpoints:
-            self._endpoints[topic, role] = endpoints
+        if wanted:
+            self._endpoints[name, role] = wanted
         else:
-            self._endpoints.pop((topic, role), None)
+            self._endpoints.pop((name, role), None)
 
     def forget_node(self, node: str) -> None:
         """Remove a node for good: another one has its name."""
         self._refused.add(node)
-        for (topic, role), endpoints in list(self._endpoints.items()):
-            self.declare(topic, role, endpoints)
+        for (name, role), endpoints in list(self._endpoints.items()):
+            self.declare(name, role, endpoints)
 
     def _wanted(self) -> set[str]:
         module = {self.module_node} - self._refused if self._keep_module_node or not self._counts else set()
@@ -67,5 +95,10 @@ class Registrations:
         self.nodes = wanted
 
 
-def _sorted(endpoints: set[RosEndpoint]) -> list[RosEndpoint]:
-    return sorted(endpoints, key=lambda each: (each.node, each.topic))
+def _sorted(endpoints: Collection[Registered]) -> list[Registered]:
+    return sorted(
+        endpoints, key=lambda each: (each.node, each.topic if isinstance(each, RosEndpoint) else each.service)
+    )
+
+
+def _do_nothing(endpoint: object) -> None: ...

@@ -8,17 +8,23 @@ A service without a class of its own is named after the type of its requests. Th
 name, as `test_msgs/action/Fibonacci_SendGoal`.
 """
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import msgspec
 
 from r2p.codecs.services import HEADER_SIZE, REQUESTS
 from r2p.errors import MessageError
 from r2p.messages import Layout, Message, Nested, layout, show
+from r2p.ros.cdr import cdr
 from r2p.ros.definitions import service_md5
 from r2p.ros.hashes import TypeDescriptions
 from r2p.ros.library import definitions_with_those_of_ros
 from r2p.ros.middleware import RosService
+from r2p.services.definition import Definition
+
+Convert: TypeAlias = Callable[[bytes], bytes]
 
 
 class _Nothing(Message, name="std_srvs/srv/Empty_Request"):
@@ -33,6 +39,10 @@ class ServiceShape(msgspec.Struct, frozen=True, eq=False):
     response: Layout[Any]
     requests: Layout[Any]
     responses: Layout[Any]
+
+    def definition(self, name: str) -> Definition[Any, Any]:
+        """Return the definition of a service of this type in r2p."""
+        return Definition(name, self.request, self.response, self.requests, self.responses)
 
 
 def service_shape(requests: Layout[Any], responses: Layout[Any]) -> ServiceShape:
@@ -68,3 +78,41 @@ def service_type(shape: ServiceShape, version: int) -> RosService:
 def ros2_service_name(name: str) -> str:
     """Return the name of a service's type as ROS 2 writes it: `std_srvs/srv/SetBool`."""
     return name if name.count("/") > 1 else name.replace("/", "/srv/")
+
+
+# Bytes
+
+
+class RosServiceCodec(msgspec.Struct, frozen=True, eq=False):
+    """A service between the two sides: its shape here, its type there, and what makes one's bytes of the other's.
+
+    The functions raise DecodeError for bytes that are not of the type, and MessageError for what the other side has no
+    room for.
+    """
+
+    shape: ServiceShape
+    type: RosService
+    request_to_ros: Convert
+    request_from_ros: Convert
+    response_to_ros: Convert
+    response_from_ros: Convert
+
+
+def service_codec(shape: ServiceShape, version: int) -> RosServiceCodec:
+    """Return the codec of a service in ROS 1 or 2 (`version`). Raises MessageError for types that ROS can't define."""
+    parts = (*_convert(shape.request, version), *_convert(shape.response, version))
+    return RosServiceCodec(shape, service_type(shape, version), *parts)
+
+
+def _convert(part: Layout[Any], version: int) -> tuple[Convert, Convert]:
+    """Return what makes bytes of ROS of packed ones, and the other way around; those of ROS 1 are the same."""
+    if version == 1:
+        return bytes, functools.partial(_checked, part)
+    cls: type[Message] = part.cls
+    codec, encode, decode = cdr(cls), part.encode, part.decode
+    return lambda data: codec.encode(decode(data)), lambda data: encode(codec.decode(data))
+
+
+def _checked(part: Layout[Any], data: bytes) -> bytes:
+    part.decode(data)
+    return bytes(data)

@@ -195,7 +195,9 @@ class FakeRosNetwork:
             )
 
         servers = frozenset(
-            RosPeerServer(server.node, server.service, server.type.name, server.type.checksum)
+            RosPeerServer(
+                server.node, server.service, *((server.type.name, server.type.checksum) if self.version == 2 else ())
+            )
             for owner, server in self.servers.values()
             if owner is not participant
         )
@@ -222,7 +224,7 @@ class RosNode(Participant):
         self.network = network
         self._publishers: dict[str, Port] = {}
         self._subscribers: dict[int, tuple[type[Message] | None, list[Any]]] = {}
-        self._handlers: dict[str, Callable[[bytes], bytes]] = {}
+        self._handlers: dict[str, Callable[[bytes], Awaitable[bytes]]] = {}
         network.nodes[name] = self
         network.join(self)
 
@@ -248,8 +250,8 @@ class RosNode(Participant):
         self._subscribers[id(port)] = None if raw else cls, received
         return received
 
-    def serve(self, service: str, type: RosService, handler: Callable[[bytes], bytes]) -> None:
-        """Serve a service; what the handler raises is the error of the call."""
+    def serve(self, service: str, type: RosService, handler: Callable[[bytes], Awaitable[bytes]]) -> None:
+        """Serve a service; what the handler raises is the error of the call, whose end cancels it."""
         self._handlers[service] = handler
         self.network.servers[service] = self, RosServer(self.name, service, type)
         self.network.changed()
@@ -267,10 +269,16 @@ class RosNode(Participant):
         received.append(arrival if cls is None else _decode(cls, arrival.data, self.network.version))
 
     def requested(self, service: str, caller: str, request: bytes, answer: "asyncio.Future[bytes]") -> None:
+        task = asyncio.create_task(self._handle(service, request, answer))
+        answer.add_done_callback(lambda _: task.cancel())
+
+    async def _handle(self, service: str, request: bytes, answer: "asyncio.Future[bytes]") -> None:
         try:
-            answer.set_result(self._handlers[service](request))
+            data = await self._handlers[service](request)
         except Exception as error:  # noqa: BLE001 - the caller gets it
             answer.set_exception(ServiceError(str(error)))
+        else:
+            answer.set_result(data)
 
 
 class FakeMiddleware(Middleware, Participant):
