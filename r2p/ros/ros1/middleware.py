@@ -193,11 +193,9 @@ class Ros1Middleware(Middleware):
             self._publishers[node, topic] = publishers
             self._connect(subscription)
 
-    def tcpros_address(self, node: str, topic: str) -> tuple[str, int] | None:
-        """Return where the node's publisher of a topic accepts connections; None: it has none."""
-        if (node, topic) not in self._publications:
-            return None
-        return self._session.address.host, self._listeners[node].port
+    def tcpros_port(self, node: str, topic: str) -> int | None:
+        """Return the port where the node's publisher of a topic accepts connections; None: it has none."""
+        return self._listeners[node].port if (node, topic) in self._publications else None
 
     def connections(self, node: str) -> Iterable[BusConnection]:
         """Return all connections of topics that a node has."""
