@@ -23,6 +23,8 @@ class TokenGraph:
 
     def __init__(self, session: str, lost: LoggedCounter) -> None:
         """`session` is this one, whose own tokens are left out."""
+        self.version = 0
+        """Counts changes."""
         self._session = session
         self._lost = lost
         self._tokens: dict[str, RmwToken] = {}
@@ -47,6 +49,7 @@ class TokenGraph:
             self._lost["too many tokens"] += 1
             return None
         self._tokens[key] = token
+        self.version += 1
         if token.kind != EntityKind.NODE:
             self._by_name.setdefault((token.kind, token.name), {})[key] = token
             self._by_gid[gid_of(key)] = token
@@ -54,6 +57,7 @@ class TokenGraph:
 
     def remove(self, key: str) -> RmwToken | None:
         """Forget a token, and return it; None for an unknown one."""
+        self.version += 1
         token = self._tokens.pop(key, None)
         if token is None or token.kind == EntityKind.NODE:
             return token
@@ -64,13 +68,12 @@ class TokenGraph:
             del self._by_name[index]
         return token
 
-    def clear(self) -> list[RmwToken]:
-        """Forget and return all tokens."""
-        tokens = list(self._tokens.values())
+    def clear(self) -> None:
+        """Forget all tokens."""
+        self.version += 1
         self._tokens.clear()
         self._by_name.clear()
         self._by_gid.clear()
-        return tokens
 
     def endpoints(self, kind: EntityKind, name: str) -> Iterable[RmwToken]:
         """Return the endpoints of this kind on a topic, or for a service."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from r2p.errors import TransportError
+from r2p.ros.options import URL_OPTIONS, RosOptions, from_parsed
 from r2p.transports.url import Url
 from r2p.transports.zenoh.config import ZenohOptions, build_config, connection_settings, endpoint_text, plain_text
 
@@ -39,6 +40,7 @@ class Ros2Options(msgspec.Struct, frozen=True):
     """The URL without its options."""
     domain: int
     zenoh: ZenohOptions
+    ros: RosOptions = RosOptions()
     overrides: dict[str, str] = {}
     """Keys of zenoh's configuration, and their values in JSON5, of ZENOH_CONFIG_OVERRIDE."""
 
@@ -49,7 +51,8 @@ class Ros2Options(msgspec.Struct, frozen=True):
 
 def parse_options(url: Url, environ: Mapping[str, str] = os.environ) -> Ros2Options:
     """Parse and check a URL. Raises TransportError."""
-    given = url.parsed(PARSERS)
+    given = url.parsed(URL_OPTIONS | PARSERS)
+    ros = from_parsed(given)
     endpoint = url.address or None
     if endpoint is not None:
         try:
@@ -66,7 +69,7 @@ def parse_options(url: Url, environ: Mapping[str, str] = os.environ) -> Ros2Opti
         config=None if config is None else Path(config),
     )
     domain = given["domain"] if "domain" in given else _domain_of(environ)
-    return Ros2Options(name, domain, zenoh, _overrides(environ.get("ZENOH_CONFIG_OVERRIDE", "")))
+    return Ros2Options(name, domain, zenoh, ros, _overrides(environ.get("ZENOH_CONFIG_OVERRIDE", "")))
 
 
 def zenoh_config(options: Ros2Options) -> "zenoh.Config":
@@ -132,4 +135,4 @@ PARSERS: dict[str, Callable[[str], Any]] = {
     "config": str,
     "shm": _one_of("on", "off"),
 }
-"""The options of the URL, and what converts them."""
+"""The options of the URL that other ROS links do not have, and what converts them."""

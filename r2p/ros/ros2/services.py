@@ -6,9 +6,10 @@ again.
 """
 
 import asyncio
+import contextlib
 import math
 from collections import OrderedDict
-from collections.abc import Hashable
+from typing import TYPE_CHECKING
 
 import zenoh
 from zenoh.handlers import Callback
@@ -29,6 +30,9 @@ from r2p.ros.ros2.keys import (
 )
 from r2p.ros.ros2.session import RmwSession
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable
+
 _REMEMBERED_MAX = 256  # requests of a service whose answers are kept for repetitions
 _KEPT_BYTES_MAX = 4096  # bytes of such an answer; a request with a longer one is served again
 _ATTACHMENT_MAX = 512  # bytes; longer ones are not read
@@ -48,10 +52,12 @@ class RmwRequest:
         self.done = False
         self.kept: bytes | str | None = None
         """The answer for repetitions, if it is short: a response, or an error's text."""
+        self.cancel: Callable[[], object] = lambda: None
+        """Ends the handling: the caller is gone."""
+        self.gid = gid
         self._session = session
         self._key = key
         self._sequence = sequence
-        self._gid = gid
 
     def answer(self, response: bytes) -> None:
         """Send the response."""
@@ -72,23 +78,19 @@ class RmwRequest:
 
     def reply(self, query: zenoh.Query, answer: bytes | str) -> None:
         """Reply to one of the queries of this request."""
-        now = self._session.clock.now()
-        try:
-            if isinstance(answer, str):
-                query.reply_err(answer)
-            else:
-                attachment = encode_attachment(self._sequence, now, self._gid.ljust(GID_BYTES, b"\0")[:GID_BYTES])
-                query.reply(
-                    self._key,
-                    bytes(answer),
-                    attachment=attachment,
-                    priority=zenoh.Priority.INTERACTIVE_HIGH,
-                    congestion_control=zenoh.CongestionControl.DROP,  # never BLOCK: that would stop the loop
-                    express=True,
-                )
-            query.drop()
-        except zenoh.ZError:  # the session is closed
-            self._session.lost["responses, link down"] += 1
+        session = self._session
+        gid = self.gid[:GID_BYTES].ljust(GID_BYTES, b"\0")
+        header = encode_attachment(self._sequence, session.clock.now(), gid)
+
+        def send() -> None:  # with the priority of the query
+            with contextlib.suppress(zenoh.ZError):  # the session is closed
+                if isinstance(answer, str):
+                    query.reply_err(answer)
+                else:
+                    query.reply(self._key, bytes(answer), attachment=header)
+                query.drop()
+
+        session.requests.submit(send)
 
 
 class RmwServer:
@@ -102,10 +104,10 @@ class RmwServer:
         self._key = data_key(session.domain, server.service, dds_name, server.type.checksum)
         handler = Callback(session.queue(self._on_query).put, indirect=False)
         remote = zenoh.Locality.REMOTE
-        self._queryable = session.zenoh.zenoh.declare_queryable(
-            self._key, handler, complete=True, allowed_origin=remote
+        self._queryable = session.zenoh.raw.declare_queryable(self._key, handler, complete=True, allowed_origin=remote)
+        self.token = session.declare(
+            EntityKind.SERVER, server.node, server.service, dds_name, server.type.checksum, _QOS
         )
-        self.token = session.declare(EntityKind.SERVER, server.node, server.service, dds_name, server.type.checksum, _QOS)
 
     def close(self) -> None:
         """Undeclare the server, and refuse requests that wait."""
@@ -114,6 +116,14 @@ class RmwServer:
         for request in self._requests.values():
             request.refuse(f"the server of {self.server.service} ended")
         self._requests.clear()
+
+    def cancel(self, gid: bytes) -> None:
+        """Cancel the requests of a client that is gone."""
+        for request in list(self._requests.values()):
+            if request.gid == gid and not request.done:
+                request.done = True
+                request.queries.clear()
+                self._session.lost.guard(request.cancel)
 
     def _on_query(self, query: zenoh.Query) -> None:
         payload, header = query.payload, query.attachment
@@ -144,7 +154,9 @@ class RmwServer:
         self._forget_old()
         service = self.server.service
         caller = self._session.graph.node_of(gid, EntityKind.CLIENT, service)
-        self._session.user.requested(service, caller, data, request.answer, request.refuse)
+        cancel = self._session.user.requested(service, caller, data, request.answer, request.refuse)
+        if not request.done:
+            request.cancel = cancel
 
     def _forget_old(self) -> None:
         """Forget the oldest answered requests; those that wait stay."""
@@ -167,10 +179,14 @@ class RmwClient:
         self.token = session.declare(EntityKind.CLIENT, node, service, self._type, type.checksum, _QOS)
         self._gid = gid_of(encode_token(self.token))
         self._sequence = 0
+        self._open: set[asyncio.Future[bytes | None]] = set()
 
     def close(self) -> None:
-        """Undeclare the client."""
+        """Undeclare the client; calls that wait end with an error."""
         self._session.undeclare(self.token)
+        for each in self._open:
+            if not each.done():
+                each.set_exception(ServiceError(f"the call of {self._service} ended: its ROS node is closed"))
 
     async def call(self, request: bytes, timeout: float) -> bytes:
         """Return the response. Raises NoServer, ServiceError or TimeoutError."""
@@ -203,28 +219,34 @@ class RmwClient:
         queue = session.queue(lambda reply: self._on_reply(reply, sequence, done))
         ends = zenoh.CancellationToken()
         attachment = encode_attachment(sequence, session.clock.now(), self._gid)
-        try:
-            session.zenoh.zenoh.get(
-                self._key,
-                Callback(queue.put, lambda: queue.put(None), indirect=False),
-                target=zenoh.QueryTarget.ALL_COMPLETE,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                payload=bytes(request),
-                attachment=attachment,
-                timeout=min(timeout + 1.0, _LONGEST_S),
-                priority=zenoh.Priority.INTERACTIVE_HIGH,
-                congestion_control=zenoh.CongestionControl.DROP,  # never BLOCK: that would stop the loop
-                express=True,
-                allowed_destination=zenoh.Locality.REMOTE,
-                cancellation_token=ends,
-            )
-        except zenoh.ZError as error:
-            raise NoServer(f"{self._service}: the session is closed") from error
+
+        def send() -> None:
+            try:
+                session.zenoh.raw.get(
+                    self._key,
+                    Callback(queue.put, lambda: queue.put(None), indirect=False),
+                    target=zenoh.QueryTarget.ALL_COMPLETE,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    payload=bytes(request),
+                    attachment=attachment,
+                    timeout=min(timeout + 1.0, _LONGEST_S),
+                    priority=zenoh.Priority.INTERACTIVE_HIGH,
+                    congestion_control=zenoh.CongestionControl.BLOCK,  # as in rmw_zenoh: routers drop no request then
+                    express=True,
+                    allowed_destination=zenoh.Locality.REMOTE,
+                    cancellation_token=ends,
+                )
+            except zenoh.ZError:  # the session is closed
+                queue.put(None)
+
+        session.requests.submit(send)
+        self._open.add(done)
         try:
             return await done
         finally:
+            self._open.discard(done)
             if done.cancelled():
-                ends.cancel()
+                session.requests.submit(ends.cancel)
 
     def _on_reply(self, reply: zenoh.Reply | None, sequence: int, done: "asyncio.Future[bytes | None]") -> None:
         """Handle a reply, or None: there are no more."""

@@ -5,8 +5,7 @@ out in the loop, except large ones: a thread hands those to zenoh, which waits f
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 import zenoh.ext
@@ -31,13 +30,9 @@ from r2p.transports.link import MESSAGES_PER_TURN
 from r2p.transports.zenoh.large import LARGE
 from r2p.transports.zenoh.session import SubscriptionReader
 
-WAITING_BYTES_MAX = 32 << 20
-"""Bytes of large messages that wait for the thread; more are lost."""
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
-WAITING_BYTES_FULL = 8 << 20
-"""Bytes of large messages from which on publishers wait that can."""
-
-_WAITING_MAX = 512  # messages that wait for the thread; more are lost
 _CACHE_DEFAULT = 42  # messages that a transient local publisher keeps that keeps all, as in rmw_zenoh
 _CACHE_MAX = 10_000
 _HEARTBEAT_S = 0.5  # seconds after which a subscriber of a transient local topic learns what it has missed
@@ -56,7 +51,7 @@ class RmwPublisher:
         self._waiting = 0
         dds_name = dds_type(endpoint.type.name)
         key = data_key(session.domain, endpoint.topic, dds_name, endpoint.type.checksum)
-        self._publisher: Any = _declare_publisher(session.zenoh.zenoh, key, endpoint)
+        self._publisher: Any = _declare_publisher(session.zenoh.raw, key, endpoint)
         self._put: Callable[..., None] = self._publisher.put
         # Behind the publisher: a node that sees the token finds the publisher there.
         kind, checksum = EntityKind.PUBLISHER, endpoint.type.checksum
@@ -95,22 +90,16 @@ class RmwPublisher:
 
     def _submit(self, data: bytes, attachment: bytes) -> None:
         """Have the thread send the message, and all later ones until it has."""
-        session = self._session
-        if session.waiting_bytes > WAITING_BYTES_MAX or self._waiting >= _WAITING_MAX:
-            session.lost["send buffer full"] += 1
+        if not self._session.add_waiting(len(data)):
+            self._session.lost["send buffer full"] += 1
             return
         self._waiting += 1
-        session.waiting_bytes += len(data)
         send = functools.partial(self._put, data, attachment=attachment)
-        self._large.submit(send, then=lambda _: self._sent(len(data)))
+        self._large.submit(send, then=functools.partial(self._sent, len(data)))
 
-    def _sent(self, size: int) -> None:
-        session = self._session
+    def _sent(self, size: int, _: object) -> None:
         self._waiting -= 1
-        was_full = session.waiting_bytes > WAITING_BYTES_FULL
-        session.waiting_bytes -= size
-        if was_full and session.waiting_bytes <= WAITING_BYTES_FULL:
-            session.user.made_room()
+        self._session.sent(size)
 
 
 def _declare_publisher(
@@ -152,6 +141,7 @@ class RmwSubscription:
         self._key = data_key(session.domain, first.topic, self._type, first.type.checksum)
         self._encoded = first.topic.encode()
         self._nodes: dict[bytes, str] = {}
+        self._graph_version = -1
         self._reader: SubscriptionReader | None = None
         self._transient_local = False
         self._held: zenoh.Sample | None = None
@@ -193,14 +183,10 @@ class RmwSubscription:
         sample, self._held = self._held, None
         self._read(sample or self._reader.receive())
 
-    def publishers_changed(self) -> None:
-        """Forget which node a gid belongs to."""
-        self._nodes.clear()
-
     def _subscribe(self, qos: Qos) -> None:
         if self._reader is not None:
             self._reader.close()
-        subscriber = _declare_subscriber(self._session.zenoh.zenoh, self._key, qos)
+        subscriber = _declare_subscriber(self._session.zenoh.raw, self._key, qos)
         self._reader = SubscriptionReader(subscriber, self._session.loop, self._read)
         self._stopped, self._held = False, None
 
@@ -247,15 +233,17 @@ class RmwSubscription:
             sequence, stamp, gid = decode_attachment(header.to_bytes())
         except DecodeError:
             raise DecodeError("wrong attachment") from None
-        node = self._nodes.get(gid)
+        node = self._nodes.get(gid) if self._graph_version == self._session.graph.version else None
         if node is None:
             node = self._node_of(gid)
         return RosArrival(self._encoded, payload.to_bytes(), node, max(sequence, 0), max(stamp, 0), gid)
 
     def _node_of(self, gid: bytes) -> str:
-        if len(self._nodes) >= _GIDS_MAX:
+        graph = self._session.graph
+        if len(self._nodes) >= _GIDS_MAX or self._graph_version != graph.version:
             self._nodes.clear()
-        node = self._nodes[gid] = self._session.graph.node_of(gid, EntityKind.PUBLISHER, self.topic)
+            self._graph_version = graph.version
+        node = self._nodes[gid] = graph.node_of(gid, EntityKind.PUBLISHER, self.topic)
         return node
 
 

@@ -207,7 +207,7 @@ class ZenohSession:
         self._token_count = 0
 
     @property
-    def zenoh(self) -> zenoh.Session:
+    def raw(self) -> zenoh.Session:
         """The session itself, for declarations that are not r2p's."""
         return self._session
 
