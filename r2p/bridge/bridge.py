@@ -32,6 +32,7 @@ from r2p.protocols.bridge.ports import (
     TreePort,
 )
 from r2p.protocols.bridge.tree import FIRST_CLIENT, SpanningTree
+from r2p.protocols.discovery.events import TopicType
 from r2p.runtime.queues import WakeScheduler
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
@@ -356,6 +357,9 @@ class _PortHooks(GatewayHooks):
 
     def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
         return self._bridge.routing.desired_state(self._port, topic, own)
+
+    def types_elsewhere(self, topic: str) -> tuple[TopicType, TopicType]:
+        return self._bridge.routing.types_elsewhere(self._port, topic)
 
     @property
     def may_announce(self) -> bool:

@@ -12,6 +12,7 @@ from r2p.codecs import UnknownType, management, probes
 from r2p.codecs.management import ManagementType
 from r2p.errors import DecodeError
 from r2p.protocols.bridge.link_selection import LinkSelection
+from r2p.protocols.discovery.events import TopicType
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.announcement import NOTHING, Announcement
@@ -272,6 +273,9 @@ class _MultihomedPort(GatewayHooks):
 
     def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
         return own if self._owner.review_use(topic, self) else NOTHING
+
+    def types_elsewhere(self, topic: str) -> tuple[TopicType, TopicType]:
+        return TopicType(), TopicType()
 
     @property
     def may_announce(self) -> bool:

@@ -274,6 +274,16 @@ class RoutingTable:
             asked=asked,
         )
 
+    def types_elsewhere(self, port: BridgePort, name: str) -> _Types:
+        """Return the types in which a topic, by its name on a link, is published and subscribed on the other links."""
+        topic = self._policy.to_canonical(name, port.name)
+        relayed = None if topic is None else self.by_name.get(topic)
+        if topic is None or relayed is None:
+            return TopicType(), TopicType()
+        published = self._type_on(topic, (each for each in relayed.published_on if each is not port), ROLE_PUBLISHES)
+        asked = self._type_on(topic, (each for each in relayed.subscribed_on if each is not port), ROLE_SUBSCRIBES)
+        return published or TopicType(), asked or TopicType()
+
     def _types(self, topic: str, port: BridgePort) -> _Types:
         """Return the types with which a link is to publish and to subscribe: those of publishers, if there are any.
 

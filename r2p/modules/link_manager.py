@@ -28,8 +28,9 @@ from r2p.codecs.management import (
 from r2p.codecs.own_services import Operation
 from r2p.errors import Error
 from r2p.log_lines import LineLimit, get_logger
+from r2p.messages import Message
 from r2p.modules.own_services import OwnServices
-from r2p.modules.type_lookup import schema
+from r2p.modules.type_lookup import find_type, schema
 from r2p.names import module_alias
 from r2p.protocols.discovery.events import (
     KIND_MODULE,
@@ -122,7 +123,7 @@ class LinkManager:
         """The start of this run (monotonic ns)."""
         allow_control |= bridge is not None and bridge.allow_control
         self.own_services = OwnServices(space, self.instance, self.links, allow_control=allow_control)
-        self.own_services.serve(Operation.SCHEMA, functools.partial(schema, space))
+        self.own_services.serve(Operation.SCHEMA, functools.partial(schema, space, self.links))
         self.flags = 0
         """The module's state, as in ALIVE."""
         self.bridge: Bridge | None = None
@@ -226,6 +227,10 @@ class LinkManager:
             logger.warning("%s refuses a connection%s: %s", url, suffix, reason)
 
     # Called by links
+
+    async def message_type(self, fingerprint: bytes, topic: str) -> type[Message] | None:
+        """Ask other modules for a message class of this layout."""
+        return await find_type(self.links, self.own_services, fingerprint, topic)
 
     def link_waits(self, link: Link, reason: str) -> None:
         """Report that the other end of a link can't be reached yet."""

@@ -11,7 +11,7 @@ import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.management import CLASS_LATCHES, NO_PARAMS, QUEUE, ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.names import name_hash
+from r2p.names import LOG, name_hash
 from r2p.protocols.discovery.aliases import LinkNames
 from r2p.protocols.discovery.announcer import LocalTopic, Relayed
 from r2p.protocols.discovery.directory import FOR_EVER, TABLE_MAX, Demand, EndpointInfo, TopicInfo
@@ -28,8 +28,8 @@ from r2p.protocols.discovery.events import (
     TopicType,
 )
 from r2p.protocols.discovery.session import DiscoveryProtocol
+from r2p.ros.graph_names import GraphNames
 from r2p.ros.middleware import RosGraph, RosPeerEndpoint
-from r2p.ros.topics import GraphNames
 from r2p.units import SECOND
 
 TopicRole = tuple[str, int]
@@ -37,7 +37,6 @@ TopicRole = tuple[str, int]
 
 _MARK_EVERY = SECOND // 2
 """Ns after which everything in the graph is marked as heard once more."""
-
 
 _CLIENTS = "clients"
 """The source of demand by ROS nodes that call services."""
@@ -95,7 +94,7 @@ class RosDiscovery(DiscoveryProtocol):
 
     def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
         self.own_nodes.setdefault((topic, role), {})[node] = publisher_class
-        self._dirty[topic] = None
+        self._dirty |= {topic: None, LOG: None}
         return []
 
     def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
@@ -103,12 +102,16 @@ class RosDiscovery(DiscoveryProtocol):
         nodes.pop(node, None)
         if not nodes:
             self.own_nodes.pop((topic, role), None)
-        self._dirty[topic] = None
+        self._dirty |= {topic: None, LOG: None}
         return []
+
+    def touch(self, topic: str) -> None:
+        """Review a topic, soon."""
+        self._dirty[topic] = None
 
     def review_all(self) -> None:
         """Review all topics of this module, soon."""
-        self._dirty |= dict.fromkeys(topic for topic, _ in self.own)
+        self._dirty |= dict.fromkeys(topic for topic, _ in [*self.own, *self.peers])
 
     # For gateways
 
@@ -146,6 +149,11 @@ class RosDiscovery(DiscoveryProtocol):
 
     # What flows
 
+    @property
+    def nodes(self) -> set[str]:
+        """The nodes of this module that publish or subscribe to anything."""
+        return {node for nodes in self.own_nodes.values() for node in nodes if node}
+
     def publishes_latched(self, topic: str) -> bool:
         """Return whether a publisher of this module, or behind this gateway, latches the topic."""
         key = topic, ROLE_PUBLISHES
@@ -179,13 +187,16 @@ class RosDiscovery(DiscoveryProtocol):
         else:
             self._demand.remove(topic, role, _CLIENTS)
 
-    def set_type(self, topic: str, known: TopicType) -> None:
+    def peers_of(self, topic: str) -> list[RosPeerEndpoint]:
+        """Return the publishers and subscribers of other ROS nodes."""
+        return [*self.peers.get((topic, ROLE_PUBLISHES), ()), *self.peers.get((topic, ROLE_SUBSCRIBES), ())]
+
+    def set_type(self, topic: str, known: TopicType | None) -> None:
         """Enter the type here of a topic that ROS nodes have."""
         info = self.topics.get(topic)
         if info is not None:
             for role in (ROLE_PUBLISHES, ROLE_SUBSCRIBES):
-                if (topic, role) in self.peers:
-                    info.set_type(role, known)
+                info.set_type(role, known if (topic, role) in self.peers else None)
 
     def publisher_type(self, topic: str, module: str) -> TopicType:
         info = self.topics.get(topic)
@@ -246,13 +257,14 @@ class RosDiscovery(DiscoveryProtocol):
             del self.topics[topic]
         changed = (key for key in before.keys() | self.peers.keys() if before.get(key) != self.peers.get(key))
         self._dirty |= dict.fromkeys(sorted({topic for topic, _ in changed}))
-        self._mark_at = now + _MARK_EVERY if graph.nodes else None
+        self._mark_at = now + _MARK_EVERY if graph.nodes or self.peers else None
         return self._set_modules(now, graph)
 
     def _enter(self, now: int, role: int, endpoint: RosPeerEndpoint) -> None:
         topic = self._names.from_ros(endpoint.topic)
         if topic is None:
-            if endpoint.topic not in self._not_carried and len(self._not_carried) < TABLE_MAX:
+            is_new = endpoint.topic not in self._not_carried and len(self._not_carried) < TABLE_MAX
+            if is_new and self._names.is_inside(endpoint.topic):
                 self._not_carried.add(endpoint.topic)
                 self.counts["name not carried"] += 1
             return

@@ -5,6 +5,7 @@ ros1_md5(Imu), ros2_hash(Imu)                what the two ends of a connection c
 DefinitionFile(path).read(2)                 of a .msg, .srv or .action file, and of what it needs
 """
 
+import contextlib
 import difflib
 import functools
 import re
@@ -41,6 +42,12 @@ def definitions_of_ros(name: str, version: int) -> dict[str, MessageDefinition]:
 def names_of_ros(version: int) -> list[str]:
     """Return the names of all types that come with ROS 1 or 2. Raises MessageError if rosbags is missing."""
     return [each.replace("/msg/", "/") for each in _store(version).types]
+
+
+def load_definitions(version: int) -> None:
+    """Read the definitions of ROS, which takes a tenth of a second at first; do nothing if rosbags is missing."""
+    with contextlib.suppress(MessageError):
+        _store(version)
 
 
 @functools.cache

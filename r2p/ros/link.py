@@ -3,22 +3,32 @@
     publisher  ->  BufferedSubscriber.offer  ->  RosLink.write    ->  Middleware.publish
     Middleware ->  RosLink.received          ->  RosLink.sample   ->  Topic.deliver
 
-`RosDiscovery` has what other ROS nodes publish and subscribe to, and calls `_review` for each topic of this module that
-changes; with its class known, it is registered at the middleware (`Registrations`), as that of ROS nodes. `RosTopic`
-converts messages.
+`RosDiscovery` has what other ROS nodes publish and subscribe to, and calls `_review` for each topic that changes. With
+its class known (`TopicClasses`), and so how it travels (`RosTopic`), it is registered at the middleware
+(`Registrations`), as that of ROS nodes.
+
+Gateways find each other by their own messages, on a topic of their own: two of them that join the same networks would
+otherwise pass each message on for ever.
 """
 
-from collections.abc import Callable, Hashable
-from typing import ClassVar
+import asyncio
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 
-from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.clock import in_background
+from r2p.codecs import management
+from r2p.codecs.management import GATEWAY_TYPES, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError, MessageError
-from r2p.messages import SIZE_MAX
+from r2p.messages import SIZE_MAX, Len, Message, layout
+from r2p.names import LOG, SERVICE_SUFFIXES
 from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import TopicType
+from r2p.ros.cdr import cdr
 from r2p.ros.discovery import RosDiscovery
+from r2p.ros.graph_names import GraphNames
+from r2p.ros.library import load_definitions
 from r2p.ros.middleware import (
     Answer,
     Cancel,
@@ -29,16 +39,36 @@ from r2p.ros.middleware import (
     RosArrival,
     RosEndpoint,
     RosGraph,
+    RosType,
 )
 from r2p.ros.options import RosOptions, lookup
+from r2p.ros.qos import publisher_qos, subscriber_qos
 from r2p.ros.registrations import Registrations
 from r2p.ros.services import RosServices, ServiceArrival
-from r2p.ros.topics import GraphNames, RosTopic, TopicTypes, is_own, is_service
+from r2p.ros.topic_classes import TopicClasses
+from r2p.ros.topics import RosTopic, TopicTypes, is_own, ros_type
 from r2p.runtime.sample import Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.link import Hub, Transport, unique_name
 from r2p.transports.stats import LoggedCounter
+
+GATEWAYS = "/_r2p/gateways"
+"""The topic on which gateways find each other; ROS's lists hide it, as its name begins with an underscore."""
+
+_GATEWAYS_KEY = GATEWAYS.encode()
+_GATEWAYS_QOS = Qos(depth=100)
+_OFF_ROS_AFTER_S = 3.0  # from when a topic is not on ROS until that is reported: its type may be on its way
+
+_UNKNOWN = "type unknown"
+_NOT_ON_ROS = "not on ROS"
+_ROLES = (ROLE_PUBLISHES, ROLE_SUBSCRIBES)
+
+
+class GatewayMessage(Message, name="r2p_msgs/GatewayMessage"):
+    """A message between gateways, which has the same bytes on all links."""
+
+    data: Annotated[bytes, Len(management.SIZE)]
 
 
 class _Published(msgspec.Struct, frozen=True, eq=False):
@@ -48,7 +78,7 @@ class _Published(msgspec.Struct, frozen=True, eq=False):
     """
 
     name: str
-    travel: RosTopic
+    encode: Callable[[Sample], Sequence[bytes]]
     node: str
     nodes: dict[tuple[str, str], str]
 
@@ -63,76 +93,109 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.options = options
         self.middleware = middleware
         self.names = GraphNames(options)
-        self.types = TopicTypes(middleware.version, options)
         name = unique_name(name, hub)
         counts = LoggedCounter(name, hub.space.clock)
-        self._ros = RosDiscovery(hub.space.module, hub.instance, self.names, self._review, counts)
+        self._ros = RosDiscovery(hub.space.module, hub.instance, self.names, self._review_safely, counts)
         super().__init__(name, hub, discovery=self._ros)
         middleware.lost = self.stats.lost
         self.off_ros: dict[str, str] = {}
         """The topics that are not on the ROS network, and why."""
+        self._types = TopicTypes(middleware.version, options, hub.space.module, self.stats.lost)
+        self._classes = TopicClasses(hub.space, self._types, hub.message_type, middleware.describe, self._touch)
         self._registrations = Registrations(middleware, self.names.node(hub.space.module))
         self.services = RosServices(self, hub, self._ros, self._registrations)
         self._published: dict[str, _Published] = {}
         self._subscribed: dict[str, RosTopic] = {}
         self._by_ros_name: dict[str, str] = {}
+        self._found: dict[str, set[str]] = {}
+        """The ROS nodes whose messages of a topic arrive."""
+        self._latched: set[str] = set()
+        """Topics that a ROS node latches."""
+        self._reported: set[str] = set()
+        """Topics that were reported as not on ROS."""
         self._sources: dict[str, Source] = {}
+        self._gateways: RosType | None = None
 
     # Own topics
 
+    def topic_changed(self, topic: Topic) -> None:
+        super().topic_changed(topic)
+        self._touch(topic.name)  # its types on other links, or its queues, may have changed
+
+    def _touch(self, topic: str) -> None:
+        if not self._closed:
+            self._ros.touch(topic)
+            self._apply(())
+
+    def _review_safely(self, topic: str) -> None:
+        self.stats.lost.guard(self._review, topic)
+
     def _review(self, topic: str) -> None:
         """Register a topic as it is now used, or remove it."""
+        self._join_gateways()
         if self._is_service(topic):
             self._apply(self.services.review(topic))
             return
-        name, travel, reason = self.names.to_ros(topic), None, ""
-        publishes, subscribes = (topic, ROLE_PUBLISHES) in self._ros.own, (topic, ROLE_SUBSCRIBES) in self._ros.own
-        if publishes or subscribes:
-            travel, reason = self._travel(topic, name)
-        if reason:
-            self._keep_off(topic, reason)
-        else:
-            self.off_ros.pop(topic, None)
+        own = self._ros.own
+        publishes, subscribes = (topic, ROLE_PUBLISHES) in own, (topic, ROLE_SUBSCRIBES) in own
+        name = self.names.to_ros(topic)
+        travel, reason = self._travel(topic, name) if publishes or subscribes else (None, "")
+        self._note_off_ros(topic, reason)
         if travel is None or name is None:
             self._remove(topic)
+            self._learn_type(topic)
             return
         self._by_ros_name[name] = topic
         self._publish(topic, name, travel if publishes else None)
         self._subscribe(topic, name, travel if subscribes else None)
-        shape = travel.shape
-        self._ros.set_type(topic, TopicType(shape.size, shape.fingerprint, shape.varies))
+        self._ros.set_type(topic, _topic_type(travel))
 
     def _is_service(self, topic: str) -> bool:
+        """Return whether a topic is one of the two of a service: also `wheel_r` may be a topic as any other."""
+        if not topic.endswith(SERVICE_SUFFIXES):
+            return False
+        if topic in self.services:
+            return True
         known = self._space.topics.get(topic)
-        return is_service(topic, None if known is None else known.layout)
+        if known is not None and known.layout is not None:
+            return known.layout.name.endswith(topic[-2:])
+        other = next(topic[:-2] + each for each in SERVICE_SUFFIXES if each != topic[-2:])
+        return any((other, role) in table for table in (self._ros.own, self._ros.peers) for role in _ROLES)
 
     def _travel(self, topic: str, name: str | None) -> tuple[RosTopic | None, str]:
-        """Return how a topic travels, or why it does not; it need not be said of r2p's own topics."""
-        known = self._space.topics.get(topic)
-        shape = None if known is None else known.layout
+        """Return how a topic travels, or why it does not; for r2p's own topics there is no reason to give."""
         asked = lookup(self.options.types, topic) or lookup(self.options.ros_types, topic)
         if is_own(topic) and not asked:
             return None, ""
         if name is None:
-            return None, "ROS has no such names: each part begins with a letter, and all have at most 240 characters"
+            return None, "ROS has no such names: parts begin with a letter, and all have at most 240 characters"
+        hooks, nothing = self.gateway_hooks, (TopicType(), TopicType())
+        elsewhere = nothing if hooks is None else hooks.types_elsewhere(topic)
+        peers = self._ros.peers_of(topic)
+        cls = self._classes.find(topic, elsewhere, peers)
+        if cls is None:
+            return None, _UNKNOWN
         try:
-            travel = self.types.find(topic, shape)
+            return self._types.find(topic, cls, {each.type for each in peers if each.type}), ""
         except MessageError as error:
             return None, str(error)
-        return travel, "" if travel is not None else "type unknown"
 
-    def _keep_off(self, topic: str, reason: str) -> None:
-        if self.off_ros.get(topic) != reason:
-            self.off_ros[topic] = reason
-            self.stats.lost["not on ROS"] += 1
+    def _learn_type(self, topic: str) -> None:
+        """Find out the type of a topic that ROS nodes have, and this side does not, or does not know."""
+        peers = self._ros.peers_of(topic)
+        if not peers:
+            return
+        cls = self._classes.of_peers(topic, peers)
+        self._ros.set_type(topic, None if cls is None else _class_type(cls))
 
     def _remove(self, topic: str) -> None:
         self._published.pop(topic, None)
         self._subscribed.pop(topic, None)
-        self._registrations.declare(topic, ROLE_PUBLISHES, set())
-        self._registrations.declare(topic, ROLE_SUBSCRIBES, set())
-        for name in [name for name, each in self._by_ros_name.items() if each == topic]:
-            del self._by_ros_name[name]
+        for role in _ROLES:
+            self._registrations.declare(topic, role, set())
+        if (name := self.names.to_ros(topic)) is not None and self._by_ros_name.pop(name, None) is not None:
+            self._found.pop(topic, None)
+            self._latched.discard(topic)
         self._apply(self._ros.set_subscribed(topic, subscribed=False))
         self._apply(self._ros.set_published(topic, published=False))
 
@@ -142,15 +205,14 @@ class RosLink(BufferedLink, MiddlewareUser):
             self._registrations.declare(topic, ROLE_PUBLISHES, set())
             return
         nodes = self._nodes(topic, ROLE_PUBLISHES)
-        default = self._registrations.module_node if len(set(nodes.values())) != 1 else next(iter(nodes.values()))
-        self._published[topic] = _Published(name, travel, default, nodes)
+        shown = sorted(set(nodes.values()))
+        default = shown[0] if len(shown) == 1 else self._registrations.module_node
+        self._published[topic] = _Published(name, travel.encode, default, nodes)
         latched = self._ros.publishes_latched(topic)
-        qos = self._qos(topic, Qos(transient_local=latched, depth=1 if latched else 10))
-        shown = set(nodes.values()) or {default}
-        self._registrations.declare(
-            topic, ROLE_PUBLISHES, {RosEndpoint(node, name, travel.type, qos) for node in shown}
-        )
-        if latched:  # the middleware keeps the values for later subscribers, so it has to get each
+        qos = publisher_qos(self._space.topics.get(topic), latched=latched, change=lookup(self.options.qos, topic))
+        endpoints = {RosEndpoint(node, name, travel.type, qos) for node in shown or [default]}
+        self._registrations.declare(topic, ROLE_PUBLISHES, endpoints)
+        if qos.transient_local:  # the middleware keeps the values for later subscribers, so it has to get each
             self._apply(self._ros.set_subscribed(topic, subscribed=True))
 
     def _subscribe(self, topic: str, name: str, travel: RosTopic | None) -> None:
@@ -159,15 +221,18 @@ class RosLink(BufferedLink, MiddlewareUser):
             self._registrations.declare(topic, ROLE_SUBSCRIBES, set())
             return
         self._subscribed[topic] = travel
-        nodes = set(self._nodes(topic, ROLE_SUBSCRIBES).values()) or {self._registrations.module_node}
-        qos = self._qos(topic, Qos())
+        shown = set(self._nodes(topic, ROLE_SUBSCRIBES).values()) or {self._registrations.module_node}
+        publishers = self._ros.peers.get((topic, ROLE_PUBLISHES), [])
+        qos = subscriber_qos(self._space.topics.get(topic), publishers, lookup(self.options.qos, topic))
         self._registrations.declare(
-            topic, ROLE_SUBSCRIBES, {RosEndpoint(node, name, travel.type, qos) for node in nodes}
+            topic, ROLE_SUBSCRIBES, {RosEndpoint(node, name, travel.type, qos) for node in shown}
         )
 
     def _nodes(self, topic: str, role: int) -> dict[tuple[str, str], str]:
         """Return the ROS nodes that have a topic, by module and node."""
         own = self._ros.own_nodes.get((topic, role), {})
+        if topic == LOG:  # of all nodes of the module: one of them publishes it
+            own = dict.fromkeys(sorted(self._ros.nodes - {LOG})[:1], 0)
         found = {("", node): self.names.node(node) for node in own if node}
         if self.options.ros_nodes:
             for module, node in self._ros.relayed_nodes.get((topic, role), {}):
@@ -175,9 +240,36 @@ class RosLink(BufferedLink, MiddlewareUser):
                     found[module, node] = self.names.node(module, node)
         return found
 
-    def _qos(self, topic: str, qos: Qos) -> Qos:
-        change = lookup(self.options.qos, topic)
-        return qos if change is None else change.apply(qos)
+    # What is reported
+
+    def _note_off_ros(self, topic: str, reason: str) -> None:
+        """Note why a topic is not on the ROS network; empty if it is. It is reported and counted if it stays so."""
+        if not reason:
+            self.off_ros.pop(topic, None)
+            return
+        is_new = topic not in self.off_ros
+        self.off_ros[topic] = reason
+        if is_new:
+            in_background(self._space.loop.call_later(_OFF_ROS_AFTER_S, self._report_off_ros, topic))
+
+    def _report_off_ros(self, topic: str) -> None:
+        reason = self.off_ros.get(topic)
+        if reason is None or self._closed or topic in self._reported:
+            return
+        self._reported.add(topic)
+        self.stats.lost[_NOT_ON_ROS] += 1
+        advice = f": give --type {topic}=TYPE" if reason == _UNKNOWN else ""
+        self.notice(_NOT_ON_ROS, f"{topic} is not on ROS: {reason}{advice}", trouble=False)
+
+    def not_carried(self) -> dict[str, str]:
+        return self.off_ros | self.services.off_ros
+
+    def known_types(self) -> Iterable[type[Message]]:
+        return self._classes.known
+
+    async def message_type(self, fingerprint: bytes) -> type[Message] | None:
+        known = (cls for cls in self._classes.known if layout(cls).fingerprint == fingerprint)
+        return next(known, None)
 
     # Out
 
@@ -191,29 +283,50 @@ class RosLink(BufferedLink, MiddlewareUser):
             if topic in self.services:
                 self.services.write(topic, sample)
                 return
-            self.stats.lost["not on ROS"] += 1
+            self.stats.lost[_NOT_ON_ROS] += 1
             return
         try:
-            data = published.travel.encode(sample)
+            messages = published.encode(sample)
         except (DecodeError, MessageError):
             self.count_unsendable(topic, sample, "not convertible")
             return
-        source, node = sample.source, published.node
+        node = published.node
         if len(published.nodes) > 1:
+            source = sample.source
             node = published.nodes.get((source.module if source.link else "", source.node), node)
-        self.stats.sent += 1
-        self.stats.bytes_sent += len(data)
-        self.middleware.publish(node, published.name, data, sample.stamp)
-
-    def close(self) -> None:
-        self.services.close()
-        super().close()
+        for data in messages:
+            self.stats.sent += 1
+            self.stats.bytes_sent += len(data)
+            self.middleware.publish(node, published.name, data, sample.stamp)
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        """Do nothing: ROS nodes have no use for it."""
+        """Send what gateways say to each other; for everything else ROS nodes have no use."""
+        if self._gateways is not None and management.type_of(data) in GATEWAY_TYPES:
+            message = GatewayMessage(data)
+            packed = message.encode() if self.middleware.version == 1 else cdr(GatewayMessage).encode(message)
+            self.middleware.publish(self._registrations.module_node, GATEWAYS, packed, self._clock.now())
 
     def write_call(self, data: bytes, to: Hashable) -> None:
         """Do nothing: ROS nodes have no use for it."""
+
+    # Gateways
+
+    def _join_gateways(self) -> None:
+        """Take part in the exchange of gateways' messages, from when the module is a gateway, or has other links."""
+        if self._gateways is not None or not (self._ros.is_gateway or len(self._space.links) > 1):
+            return
+        self._gateways = kind = ros_type(GatewayMessage, self.middleware.version)
+        self._registrations.keep_module_node()
+        endpoint = RosEndpoint(self._registrations.module_node, GATEWAYS, kind, _GATEWAYS_QOS)
+        for role in _ROLES:
+            self._registrations.declare(GATEWAYS, role, {endpoint})
+
+    def receive_other(self, arrival: Any) -> None:
+        if arrival.topic != _GATEWAYS_KEY:
+            super().receive_other(arrival)
+            return
+        decode = layout(GatewayMessage).decode if self.middleware.version == 1 else cdr(GatewayMessage).decode
+        self.manage(decode(arrival.data).data, arrival.node)
 
     # In
 
@@ -226,16 +339,16 @@ class RosLink(BufferedLink, MiddlewareUser):
     def sample(self, topic: str, arrival: RosArrival | ServiceArrival) -> Sample:
         if isinstance(arrival, ServiceArrival):
             return self.services.sample(arrival)
-        data, message = self._subscribed[topic].decode(arrival.data)
+        data, message, stamp = self._subscribed[topic].decode(arrival.data)
         self.stats.bytes_received += len(arrival.data)
-        stamp = arrival.stamp
+        stamp = stamp or arrival.stamp
         return Sample(
             data,
             self._source(arrival.node),
             stamp or self._clock.now(),
             sequence=arrival.sequence,
             message=message,
-            stamped=bool(stamp),
+            stamped=stamp > 0,
         )
 
     def _source(self, node: str) -> Source:
@@ -247,11 +360,19 @@ class RosLink(BufferedLink, MiddlewareUser):
             source = self._sources[node] = Source(*names, self.name)
         return source
 
+    def latched(self, topic: str) -> bool:
+        return topic in self._latched or super().latched(topic)
+
     def pause(self) -> None:
         self.middleware.pause()
 
     def resume(self) -> None:
         self.middleware.resume()
+
+    def close(self) -> None:
+        self.services.close()
+        self._classes.close()
+        super().close()
 
     # For the middleware
 
@@ -261,6 +382,7 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def middleware_down(self, reason: str) -> None:
         self.services.graph_with_services(RosGraph())
+        self._found.clear()
         self.on_down(reason)
 
     def middleware_waits(self, reason: str) -> None:
@@ -281,11 +403,24 @@ class RosLink(BufferedLink, MiddlewareUser):
             self._apply(self._ros.set_subscribed(name, subscribed=False))
 
     def publisher_found(self, topic: str, node: str, type_name: str, definition: str, *, latched: bool = False) -> None:
-        if (name := self._by_ros_name.get(topic)) is not None:
-            self._apply(self._ros.set_published(name, published=True))
+        name = self._by_ros_name.get(topic)
+        if name is None:
+            return
+        self._classes.add_definition(type_name, "", definition)
+        self._found.setdefault(name, set()).add(node)
+        if latched:
+            self._latched.add(name)
+        self._apply(self._ros.set_published(name, published=True))
 
     def publisher_gone(self, topic: str, node: str) -> None:
-        if (name := self._by_ros_name.get(topic)) is not None:
+        name = self._by_ros_name.get(topic)
+        found = None if name is None else self._found.get(name)
+        if name is None or found is None or node not in found:
+            return
+        found.remove(node)
+        if not found:
+            del self._found[name]
+            self._latched.discard(name)
             self._apply(self._ros.set_published(name, published=False))
 
     def received(self, messages: list[RosArrival]) -> None:
@@ -305,6 +440,15 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.notice("ROS node ended", f"{node} is no longer a ROS node here: {reason}", trouble=True)
 
 
+def _topic_type(travel: RosTopic) -> TopicType:
+    return TopicType(travel.shape.size, travel.shape.fingerprint, travel.shape.varies)
+
+
+def _class_type(cls: type[Message]) -> TopicType:
+    shape = layout(cls)
+    return TopicType(shape.size, shape.fingerprint, shape.varies)
+
+
 MakeMiddleware = Callable[[Hub], Middleware]
 
 
@@ -318,6 +462,8 @@ class RosTransport(Transport):
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         middleware = self._make_middleware(hub)
+        if not hub.space.clock.virtual:  # now, and not while messages flow
+            await asyncio.to_thread(load_definitions, middleware.version)
         link = RosLink(self._name, hub, middleware, self.options)
         hub.attach(link)
         try:

@@ -152,7 +152,7 @@ class MiddlewareUser(Protocol):
         """
 
     def publisher_gone(self, topic: str, node: str) -> None:
-        """Note that no more messages come from this node's publisher."""
+        """Note that no more messages of a topic come from this node: its last publisher is gone."""
 
     def received(self, messages: list[RosArrival]) -> None:
         """Deliver messages that arrived, in order."""
@@ -227,11 +227,18 @@ class Middleware(abc.ABC):
 
     @abc.abstractmethod
     def subscribe(self, endpoint: RosEndpoint) -> None:
-        """Register a subscriber, connect to all publishers, and receive their messages."""
+        """Register a subscriber, connect to all publishers of other nodes, and receive their messages.
+
+        Those of the link's own nodes never come. In ROS 1 the checksum may be `*`: any type of this name will do.
+        """
 
     @abc.abstractmethod
     def unsubscribe(self, endpoint: RosEndpoint) -> None:
         """Unregister a subscriber."""
+
+    async def describe(self, endpoint: RosPeerEndpoint) -> str:
+        """Return the definition of the type of another node's endpoint, as in RosType; empty if it can't be had."""
+        return ""
 
     @abc.abstractmethod
     def pause(self) -> None:

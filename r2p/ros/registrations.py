@@ -30,15 +30,15 @@ class Registrations:
     """Registers the difference between what a topic has and should have.
 
     A ROS node is shown from its first endpoint to its last one. While there is none, the module itself is a ROS node,
-    `module_node`; with `keep_module_node` it always is.
+    `module_node`; after `keep_module_node` it always is.
     """
 
-    def __init__(self, middleware: Middleware, module_node: str, *, keep_module_node: bool = False) -> None:
+    def __init__(self, middleware: Middleware, module_node: str) -> None:
         self.module_node = module_node
         self.nodes: set[str] = set()
         """The ROS nodes of this link."""
         self._middleware = middleware
-        self._keep_module_node = keep_module_node
+        self._keep_module_node = False
         self._methods: dict[int | str, tuple[Callable[[Any], object], Callable[[Any], object]]] = {
             ROLE_PUBLISHES: (middleware.advertise, middleware.withdraw),
             ROLE_SUBSCRIBES: (middleware.subscribe, middleware.unsubscribe),
@@ -70,6 +70,15 @@ class Registrations:
             self._endpoints[name, role] = wanted
         else:
             self._endpoints.pop((name, role), None)
+
+    def keep_module_node(self) -> None:
+        """Show the module as a ROS node from now on, whatever other nodes it has."""
+        self._keep_module_node = True
+        self._add_nodes()
+
+    def endpoints(self, name: str, role: int) -> list[RosEndpoint]:
+        """Return the endpoints of a topic in a role."""
+        return [each for each in self._endpoints.get((name, role), ()) if isinstance(each, RosEndpoint)]
 
     def forget_node(self, node: str) -> None:
         """Remove a node for good: another one has its name."""

@@ -21,6 +21,7 @@ from r2p.messages import Layout
 from r2p.names import SERVICE_SUFFIXES
 from r2p.protocols.discovery.events import Event
 from r2p.ros.discovery import RosDiscovery
+from r2p.ros.graph_names import GraphNames
 from r2p.ros.middleware import (
     Answer,
     Cancel,
@@ -35,7 +36,6 @@ from r2p.ros.options import RosOptions, lookup
 from r2p.ros.registrations import CALLS, SERVES, Registrations, RosClient
 from r2p.ros.service_calls import UNKNOWN_LIFETIME, CarriedService, RosCalls, RosRequests
 from r2p.ros.service_types import RosServiceCodec, service_codec, service_shape
-from r2p.ros.topics import GraphNames
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.services.definition import define
 from r2p.services.servers import KnownServers

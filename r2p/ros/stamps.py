@@ -25,7 +25,6 @@ from r2p.units import SECOND
 STAMP_OF_RECEPTION = "stamped at reception"
 """The counter of messages whose `header.stamp` is the time at which they arrived here."""
 
-_OLDEST_UTC = 1_000_000_000 * SECOND  # ns, September 2001: no module counts its time from its start for so long
 _NAMES = ("timestamp", "stamp")
 _TIME = struct.Struct("<II")
 
@@ -60,14 +59,21 @@ def with_header_stamp(message: Any, ns: int) -> Any:
 class StampSource:
     """Finds the stamps of messages of a type on their way to ROS; STAMP_OF_RECEPTION is counted in `counts`."""
 
+    OLDEST_UTC = 1_000_000_000 * SECOND
+    """Ns, September 2001: no module counts its time from its start for so long."""
+
     def __init__(self, cls: type[Message], counts: Counter[str]) -> None:
         self._counts = counts
         self._read = _reader(layout(cls))
 
+    def own(self, data: bytes) -> int:
+        """Return the own stamp of a packed message in ns, by whichever clock; 0 without one."""
+        return self._read(data) if self._read is not None else 0
+
     def find(self, sample: Sample[Any]) -> int:
         """Return the stamp of a sample, UTC in ns."""
-        own = self._read(sample.data) if self._read is not None else 0
-        if own >= _OLDEST_UTC:
+        own = self.own(sample.data)
+        if own >= self.OLDEST_UTC:
             return own
         if own and sample.clock is not None:
             return sample.clock.utc(own)

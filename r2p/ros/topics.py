@@ -1,118 +1,55 @@
-"""Topics on a ROS network: their names there, their types, and how a message becomes one of the other side.
+"""Topics on a ROS network: which class a topic has here, which type there, and how messages become those of the other.
 
-`GraphNames` translates names of topics and nodes. `TopicTypes` decides which class a topic has here and which type
-there, and `RosTopic` is the result: with it, bytes of one side become bytes of the other.
+`TopicTypes` decides, and `RosTopic` is the result: with it, bytes of one side become bytes of the other. Types go by
+their full names: one that comes with ROS stays what it is, r2p's standard types become those of the conversions, and
+everything else is a type of its own, as `r2p msg export` writes it.
 """
 
 import functools
-import re
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import msgspec
 
 from r2p.errors import DecodeError, MessageError
-from r2p.messages import Layout, Message, layout
-from r2p.names import (
-    BUS_LOAD,
-    BUS_SLOTS,
-    CARRIED_MAX,
-    LOADER_PREFIX,
-    LOG,
-    MODULE_MAX,
-    MODULE_PATH,
-    NAMESPACE_MAX,
-    NODE_MAX,
-    RESERVED,
-    SERVICE_SUFFIXES,
-    TOPIC,
-)
+from r2p.messages import Layout, Message, Timestamp, layout
+from r2p.names import BUS_LOAD, BUS_SLOTS, LOADER_PREFIX, RESERVED
 from r2p.ros.cdr import cdr
-from r2p.ros.classes import definitions_of
-from r2p.ros.definitions import definition_text, short_name
-from r2p.ros.library import ros1_md5, ros2_hash
+from r2p.ros.classes import RosTypes, definitions_of, standard_classes
+from r2p.ros.conversions import Conversion, RosNames, conversion, standard_type
+from r2p.ros.definitions import definition_text, parse, short_name
+from r2p.ros.library import definitions_of_ros, ros1_md5, ros2_hash
 from r2p.ros.middleware import RosType
 from r2p.ros.options import RosOptions, lookup
+from r2p.ros.packages import OF_ROS
+from r2p.ros.stamps import StampSource, stamp_of
 from r2p.runtime.sample import Sample
 
-_OWN = frozenset({*RESERVED, BUS_LOAD, BUS_SLOTS, LOG, "gateway"})
-_ROS_NAMES = {LOG: "rosout"}
-_OUR_NAMES = {theirs: ours for ours, theirs in _ROS_NAMES.items()}
-_ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
-_R2P_TOPIC = re.compile(TOPIC)
-_R2P_MODULE = re.compile(MODULE_PATH)
-_FOREIGN = re.compile(r"[^A-Za-z0-9_]+")
-_ROS_MAX = 240  # characters of a name in ROS 2
+_OWN = frozenset({*RESERVED, BUS_LOAD, BUS_SLOTS, "gateway"})
 
-
-class GraphNames:
-    """Translates names: `odometry` is `/robot1/odometry` on a link with the namespace `/robot1`, `log` is `/rosout`.
-
-    What other ROS nodes have outside of the namespace is not seen here, except for the topics that ROS has once.
-    """
-
-    def __init__(self, options: RosOptions) -> None:
-        self.ns = options.ns
-        self._absolute = frozenset(options.absolute)
-
-    def to_ros(self, topic: str) -> str | None:
-        """Return the name of a topic on the ROS network; None if ROS has no such names."""
-        topic = _ROS_NAMES.get(topic, topic)
-        name = f"/{topic}" if topic in self._absolute else f"{self.ns}/{topic}"
-        return name if len(name) <= _ROS_MAX and _ROS_TOPIC.fullmatch(name) else None
-
-    def from_ros(self, name: str) -> str | None:
-        """Return the name of a ROS topic here; None for one outside of the namespace, or that no topic can have."""
-        topic = name[1:]
-        if topic not in self._absolute:
-            if not name.startswith(f"{self.ns}/"):
-                return None
-            topic = name[len(self.ns) + 1 :]
-            if topic in self._absolute and self.ns:
-                return None
-        topic = _OUR_NAMES.get(topic, topic)
-        return topic if len(topic) <= CARRIED_MAX and _R2P_TOPIC.fullmatch(topic) else None
-
-    def node(self, *parts: str) -> str:
-        """Return the full name of a ROS node for a module or node: `/robot1/blink`."""
-        valid = (f"n{part}" if part[:1].isdecimal() else part for part in "/".join(parts).split("/"))
-        return f"{self.ns}/{'/'.join(valid)}"
-
-    def module(self, node: str) -> tuple[str, str]:
-        """Return the names of module and node under which another ROS node is shown here.
-
-        `/arm/driver` is module `arm/driver` with a node `driver`; any characters are possible in the argument.
-        """
-        inner = node.removeprefix(f"{self.ns}/") if self.ns else node
-        parts = [each for part in inner.split("/") if (each := _FOREIGN.sub("_", part))]
-        last = parts[-1] if parts else "unnamed"
-        path = "/".join([parts[0], "_".join(parts[1:])]) if len(parts) > 1 else last
-        if (len(parts) > 1 and len(parts[0]) > NAMESPACE_MAX) or not _R2P_MODULE.fullmatch(path):
-            path = "_".join(parts)[:MODULE_MAX] or last
-        return path, last[:NODE_MAX]
-
-
-def is_service(topic: str, shape: Layout[Message] | None) -> bool:
-    """Return whether a topic is one of the two of a service; without a layout, by its name."""
-    return topic.endswith(SERVICE_SUFFIXES) and (shape is None or shape.name.endswith(topic[-2:]))
-
-
-def is_own(topic: str) -> bool:
-    """Return whether a topic is r2p's own, which a ROS network has no use for."""
-    return topic in _OWN or topic.startswith(LOADER_PREFIX)
+Decoded = tuple[bytes, Message | None, int]
+"""Packed bytes of the class here, the message if it is known anyway, and its stamp in UTC (ns, 0: none)."""
 
 
 class RosTopic(msgspec.Struct, frozen=True, eq=False):
     """How messages of one topic become those of a ROS type, and back.
 
-    `shape` is that of the topic's class, `type` the ROS type. `encode` returns the bytes to publish, or raises
-    MessageError or DecodeError; `decode` returns the packed bytes of that class, and the message if it is known anyway,
-    or raises DecodeError.
+    `shape` is that of the topic's class, `type` the ROS type. `encode` returns the messages to publish, serialised, or
+    raises MessageError or DecodeError; `decode` returns a message for this side, or raises DecodeError. `note` says
+    what one of the two types lacks.
     """
 
-    shape: Layout[Message]
+    shape: Layout[Any]
     type: RosType
-    encode: Callable[[Sample], bytes]
-    decode: Callable[[bytes], tuple[bytes, Message | None]]
+    encode: Callable[[Sample], Sequence[bytes]]
+    decode: Callable[[bytes], Decoded]
+    note: str = ""
+
+
+def is_own(topic: str) -> bool:
+    """Return whether a topic is r2p's own, which a ROS network has no use for."""
+    return topic in _OWN or topic.startswith(LOADER_PREFIX)
 
 
 @functools.lru_cache(maxsize=1024)
@@ -125,61 +62,185 @@ def ros_type(cls: type[Message], version: int) -> RosType:
 
 
 @functools.lru_cache(maxsize=1024)
-def ros_topic(cls: type[Message], version: int, type_name: str = "") -> RosTopic:
-    """Return how messages of a class travel on a ROS network, as the type of this name (empty: the usual one).
+def ros_class(name: str, version: int, definition: str = "") -> type[Message]:
+    """Return the class of a ROS type, from its definition; without one, from those that come with ROS.
 
-    Raises MessageError if they can't.
+    Raises MessageError for a type that is nowhere, or that r2p has no class for.
     """
-    name = short_name(type_name) if type_name else layout(cls).name
-    if name != layout(cls).name:
-        raise MessageError(f"{cls.__name__} can't become {name}")
-    return _same(cls, version)
-
-
-def _same(cls: type[Message], version: int) -> RosTopic:
-    """Return the topic of a class whose fields ROS has as well."""
-    shape, kind = layout(cls), ros_type(cls, version)
-    if version == 1:
-        return RosTopic(shape, kind, _data_of, functools.partial(_checked, shape))
-    codec = cdr(cls)
-
-    def encode(sample: Sample) -> bytes:
-        message = sample.message
-        return codec.encode(shape.decode(sample.data) if message is None else message)
-
-    def decode(data: bytes) -> tuple[bytes, Message | None]:
-        message = codec.decode(data)
-        try:
-            return shape.encode(message), message
-        except MessageError as error:
-            raise DecodeError(str(error)) from None
-
-    return RosTopic(shape, kind, encode, decode)
-
-
-def _data_of(sample: Sample) -> bytes:
-    return sample.data
-
-
-def _checked(shape: Layout[Message], data: bytes) -> tuple[bytes, Message | None]:
-    if shape.exact_size and len(data) != shape.exact_size:
-        raise DecodeError(f"{shape.cls.__name__} takes {shape.exact_size} bytes, not {len(data)}")
-    return data, None
+    name = short_name(name)
+    if definition:
+        return RosTypes(version, parse(name, definition)).load(name)
+    known = standard_classes().get(name)
+    if known is not None and name.partition("/")[0] not in OF_ROS:
+        return known
+    return RosTypes(version, definitions_of_ros(name, version)).load(name)
 
 
 class TopicTypes:
-    """Decides which class a topic has here, and which type on the ROS network."""
+    """Decides for one link to ROS 1 or 2 (`version`) how topics travel; `counts` has stamps of reception."""
 
-    def __init__(self, version: int, options: RosOptions) -> None:
-        self._version = version
+    def __init__(self, version: int, options: RosOptions, module: str, counts: Counter[str]) -> None:
+        self.version = version
         self._options = options
+        self._module = module
+        self._counts = counts
 
-    def find(self, topic: str, shape: Layout[Message] | None) -> RosTopic | None:
-        """Return how a topic travels; None if no class is known. Raises MessageError if ROS can't have its type."""
-        cls = lookup(self._options.types, topic) if shape is None else shape.cls
-        if cls is None:
+    def stated(self, topic: str) -> type[Message] | None:
+        """Return the class that the user states for a topic."""
+        return lookup(self._options.types, topic)
+
+    def find(self, topic: str, cls: type[Message], peers: set[str]) -> RosTopic:
+        """Return how a topic of this class travels. `peers` are the types that ROS nodes have for it, by name.
+
+        Without an option for the topic it is the usual type of the class, unless all peers have another one that the
+        class converts to. Raises MessageError if ROS can't have the class, or not as the type in the options.
+        """
+        stated = lookup(self._options.ros_types, topic)
+        if stated:
+            return self._as_type(topic, cls, short_name(stated))
+        usual = self._usual(cls)
+        if len(peers) == 1 and usual not in peers:
+            try:
+                return self._as_type(topic, cls, next(iter(peers)))
+            except MessageError:
+                pass  # the mismatch is reported when both are known
+        return self._as_type(topic, cls, usual)
+
+    def _usual(self, cls: type[Message]) -> str:
+        name = layout(cls).name
+        if name.partition("/")[0] in OF_ROS:
+            return name
+        return standard_type(cls, self.version) or name
+
+    def _as_type(self, topic: str, cls: type[Message], name: str) -> RosTopic:
+        if name == layout(cls).name:
+            return self._same(cls, cls, ros_type(cls, self.version))
+        names = RosNames(topic, self._options.ns, self._module)
+        found = conversion(cls, name, self.version, names)
+        if found is not None:
+            return self._converted(found)
+        theirs = ros_class(name, self.version)
+        if layout(theirs).schema != layout(cls).schema:
+            raise MessageError(f"{layout(cls).name} can't become {name}: r2p has no conversion between the two")
+        return self._same(cls, theirs, ros_type(theirs, self.version))
+
+    def _same(self, cls: type[Message], theirs: type[Message], kind: RosType) -> RosTopic:
+        """Return how a class travels as a type with the same fields."""
+        shape = layout(cls)
+        stamps = _HeaderStamps(shape, self._counts) if _has_header(shape) else None
+        if self.version == 1:
+            return RosTopic(shape, kind, _packed(stamps), _unpacked(shape))
+        return RosTopic(shape, kind, _to_cdr(shape, theirs, stamps), _from_cdr(shape, theirs))
+
+    def _converted(self, found: Conversion) -> RosTopic:
+        shape, stamps = layout(found.ours), StampSource(found.ours, self._counts)
+        pack, unpack = _codec(found.theirs, self.version)
+
+        def encode(sample: Sample) -> Sequence[bytes]:
+            message = sample.message
+            if message is None:
+                message = shape.decode(sample.data)
+            return [pack(each) for each in found.to_ros(message, stamps.find(sample), sample.source)]
+
+        def decode(data: bytes) -> Decoded:
+            theirs = unpack(data)
+            message = found.from_ros(theirs)
+            return shape.encode(message), message, _utc(stamp_of(theirs))
+
+        note = f"to ROS without {found.lost_to_ros}" if found.lost_to_ros else ""
+        return RosTopic(shape, ros_type(found.theirs, self.version), encode, _guarded(decode), note)
+
+
+def _codec(cls: type[Message], version: int) -> tuple[Callable[[Any], bytes], Callable[[bytes], Any]]:
+    if version == 1:
+        return layout(cls).encode, layout(cls).decode
+    return cdr(cls).encode, cdr(cls).decode
+
+
+def _guarded(decode: Callable[[bytes], Decoded]) -> Callable[[bytes], Decoded]:
+    """Return a function that raises DecodeError also for a message that this side can't have."""
+
+    def guarded(data: bytes) -> Decoded:
+        try:
+            return decode(data)
+        except MessageError as error:
+            raise DecodeError(str(error)) from None
+
+    return guarded
+
+
+def _utc(stamp: Timestamp | None) -> int:
+    """Return a stamp of ROS as the stamp of a sample; 0 for that of a simulation, which begins at 0."""
+    return stamp.ns if stamp is not None and stamp.ns >= StampSource.OLDEST_UTC else 0
+
+
+# Types with the same fields on both sides
+
+
+def _has_header(shape: Layout[Any]) -> bool:
+    header = next((each.shape for each in shape.fields if each.name == "header"), None)
+    return header is not None and getattr(getattr(header, "layout", None), "name", "") == "std_msgs/Header"
+
+
+class _HeaderStamps:
+    """Fills `header.stamp` of messages that have none of their own, or one of another clock."""
+
+    def __init__(self, shape: Layout[Any], counts: Counter[str]) -> None:
+        self._shape = shape
+        self._source = StampSource(shape.cls, counts)
+
+    def filled(self, sample: Sample) -> Any:
+        """Return the message with its stamp; None if the bytes of the sample have it already."""
+        found = self._source.find(sample)
+        if found == self._source.own(sample.data):
             return None
-        return ros_topic(cls, self._version, self._type_name(topic))
+        message: Any = sample.message
+        if message is None:
+            message = self._shape.decode(sample.data)
+        header = msgspec.structs.replace(message.header, stamp=Timestamp.from_ns(found))
+        return msgspec.structs.replace(message, header=header)
 
-    def _type_name(self, topic: str) -> str:
-        return lookup(self._options.ros_types, topic) or ""
+
+def _packed(stamps: _HeaderStamps | None) -> Callable[[Sample], Sequence[bytes]]:
+    def encode(sample: Sample) -> Sequence[bytes]:
+        message = None if stamps is None else stamps.filled(sample)
+        return (sample.data if message is None else message.encode(),)
+
+    return encode
+
+
+def _unpacked(shape: Layout[Any]) -> Callable[[bytes], Decoded]:
+    size, stamps = shape.exact_size, StampSource(shape.cls, Counter())
+
+    def decode(data: bytes) -> Decoded:
+        if size and len(data) != size:
+            raise DecodeError(f"{shape.cls.__name__} takes {size} bytes, not {len(data)}")
+        own = stamps.own(data)
+        return data, None, own if own >= StampSource.OLDEST_UTC else 0
+
+    return decode
+
+
+def _to_cdr(
+    shape: Layout[Any], theirs: type[Message], stamps: _HeaderStamps | None
+) -> Callable[[Sample], Sequence[bytes]]:
+    pack = cdr(theirs).encode
+
+    def encode(sample: Sample) -> Sequence[bytes]:
+        message = None if stamps is None else stamps.filled(sample)
+        if message is None:
+            message = sample.message
+        return (pack(shape.decode(sample.data) if message is None else message),)
+
+    return encode
+
+
+def _from_cdr(shape: Layout[Any], theirs: type[Message]) -> Callable[[bytes], Decoded]:
+    unpack, is_same = cdr(theirs).decode, theirs is shape.cls
+
+    def decode(data: bytes) -> Decoded:
+        message = unpack(data)
+        packed = shape.encode(message) if is_same else layout(theirs).encode(message)
+        return packed, message if is_same else None, _utc(stamp_of(message))
+
+    return _guarded(decode)

@@ -33,6 +33,7 @@ from r2p.protocols.discovery.events import (
     Send,
     SubscriberJoined,
     SubscribersGone,
+    TopicType,
     possible_senders,
 )
 from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
@@ -89,6 +90,9 @@ class Hub(GuardedHub, CallHub, Protocol):
     def discovered(self, link: "Link", event: Event) -> None:
         """Handle what the discovery of a link has found."""
 
+    async def message_type(self, fingerprint: bytes, topic: str) -> type[Message] | None:
+        """Ask other modules for a message class of this layout: that of the topic, where several have it."""
+
 
 class GatewayHooks(Protocol):
     """Decisions about one link: by its gateway, or by a module with several links to networks that gateways join."""
@@ -106,6 +110,9 @@ class GatewayHooks(Protocol):
     @property
     def has_other_gateways(self) -> bool:
         """Return whether there are other gateways on the link's network."""
+
+    def types_elsewhere(self, topic: str) -> tuple[TopicType, TopicType]:
+        """Return the types in which a topic of the link is published, and subscribed, on the gateway's other links."""
 
     def source_name(self, source: Source) -> str:
         """Return the name of a message's module, as it is on the link's network."""
@@ -392,6 +399,14 @@ class Link(abc.ABC):
         """Return a message class of this layout from a module on the link, where types can be requested."""
         return None
 
+    def not_carried(self) -> dict[str, str]:
+        """Return the topics of this side that the link does not carry, and why, where that is not their length."""
+        return {}
+
+    def known_types(self) -> Iterable[type[Message]]:
+        """Return the classes of topics at the other end that are known here, for others that ask."""
+        return ()
+
     def command(self, command: Command, module: str) -> None:
         """Send STOP, REBOOT or BOOTLOAD to a module."""
         self._apply(self.discovery.command(self._clock.monotonic(), command, module))
@@ -559,9 +574,8 @@ class LinkSubscriber(RemoteSubscriber):
         self.link.stats.lost[reason] += 1
 
     def offer_down(self, sample: Sample) -> bool:
-        """Accept a sample as lost while the link is down, if its publisher has signalled the outage.
-
-        A real-time publisher signals each sample that is missed, so its samples are not accepted.
+        """Accept a sample as lost while the link is down, if its publisher has signalled the outage, and does not
+        signal each sample that is missed, as real-time ones do.
         """
         if sample.publisher_class != PublisherClass.NON_REAL_TIME:
             return False

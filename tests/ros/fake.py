@@ -398,6 +398,9 @@ class FakeMiddleware(Middleware, Participant):
             self.user.received(held)
 
     def arrived(self, port: Port, arrival: RosArrival) -> None:
+        first = next(each for each in self.network.ports if each.owner is self and _same(each, port))
+        if port is not first:  # several nodes subscribe: it arrives once
+            return
         if self._is_paused:
             self._held.append(arrival)
         elif self.user is not None:
@@ -424,7 +427,9 @@ class FakeMiddleware(Middleware, Participant):
         if self.user is None:
             return
         if not mine.publishes:
-            self.user.publisher_gone(mine.endpoint.topic, other.endpoint.node)
+            others = [each for each in self.network.ports if each.fits(mine)]
+            if other.endpoint.node not in {each.endpoint.node for each in others}:
+                self.user.publisher_gone(mine.endpoint.topic, other.endpoint.node)
         elif self._matches[key] <= 0:
             self.user.subscribers_gone(mine.endpoint.topic)
 
@@ -457,6 +462,10 @@ class FakeMiddleware(Middleware, Participant):
         if self.user is not None:
             cancel = self.user.requested(service, caller, request, succeed, fail)
             answer.add_done_callback(lambda done: cancel() if done.cancelled() else None)
+
+
+def _same(one: Port, other: Port) -> bool:
+    return (one.publishes, one.endpoint.topic) == (other.publishes, other.endpoint.topic)
 
 
 def _encode(message: Message, version: int) -> bytes:

@@ -33,7 +33,7 @@ async def test_topics_flow_both_ways(version: int) -> None:
         await asyncio.sleep(0.1)
         graph = network.graph(listener)
     assert (speeds, goal) == ([Speed(1.0, 2.0, 3)], Speed(4.0, 5.0, 6))
-    assert {(each.node, each.topic) for each in graph.publishers} == {("/drive", "/speed")}
+    assert {(each.node, each.topic) for each in graph.publishers} == {("/drive", "/speed"), ("/drive", "/rosout")}
     assert {(each.node, each.topic) for each in graph.subscribers} == {("/drive", "/goal")}
     assert not network.graph(listener).nodes
 

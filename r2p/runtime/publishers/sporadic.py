@@ -31,6 +31,11 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
         self._pending: list[_EventDelivery[M]] = []
         self._alarm = Alarm(space.loop, self._overdue)
 
+    @property
+    def lifespan(self) -> int:
+        """Ns after which a message that has not gone is dropped; 0: it goes late."""
+        return self._deadline if self._class.late == "drop" else 0
+
     async def publish(self, message: M) -> None:
         """Publish an event; return at once, also while a queue has no room for it.
 
