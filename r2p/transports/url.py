@@ -28,15 +28,15 @@ BUILT_IN = {
     "tcp": "r2p.transports.tcp:TcpTransport",
     "tcp-listen": "r2p.transports.tcp:TcpListenTransport",
     "serial": "r2p.transports.serial:SerialTransport",
+    "ros1": "r2p.ros.ros1:from_url",
     "rtcan": "r2p.transports.rtcan.transport:from_url",
     "sim": "r2p.sim.transport:from_url",
     "zenoh": "r2p.transports.zenoh:from_url",
-    "ros2": "r2p.ros.ros2:from_url",
 }
 
 GROUP = "r2p.transports"
 
-_IP = frozenset({"tcp", "tcp-listen", "zenoh", "ros2"})
+_IP = frozenset({"ros1", "tcp", "tcp-listen", "zenoh"})
 
 _OPTIONS = re.compile(r"[?,&]")
 _CAN = re.compile(r"[a-z]*can[0-9]+")

@@ -1,1 +1,35 @@
-"""ROS 1 without ROS: names, XMLRPC with the master and other nodes, and TCPROS."""
+"""ROS 1 without ROS: `ros1:[http://MASTER:11311]`.
+
+In the order to read it:
+
+    middleware     the link's nodes on a ROS 1 network; it joins the two halves below
+    names, environment    full names, remappings, and where the master and this computer are
+    xmlrpc         calls between nodes, with xmlrpc_codec for their bytes
+    registration   keeps nodes registered with the master; master: its calls; slave: what each node answers
+    tcpros         the bytes of topics and services
+    connections    TCPROS on asyncio; publishers, subscribers and services are the four things a connection may be for
+"""
+
+import os
+from typing import TYPE_CHECKING, Any
+
+from r2p.ros.link import RosTransport
+from r2p.ros.options import URL_OPTIONS, from_parsed
+from r2p.ros.ros1.environment import find_address
+from r2p.ros.ros1.middleware import Ros1Middleware
+from r2p.transports.url import Url
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def from_url(url: Url) -> RosTransport:
+    """`ros1:[http://MASTER:11311]`; without a master, the one that `ROS_MASTER_URI` names. Raises TransportError.
+
+    Options: those of `r2p.ros.options`, and `host`: the address by which other computers reach this one, in place of
+    `ROS_HOSTNAME` and `ROS_IP`.
+    """
+    known: dict[str, Callable[[str], Any]] = {**URL_OPTIONS, "host": str}
+    parsed = url.parsed(known)
+    address = find_address(url.address, os.environ, {"hostname": parsed.pop("host", "")})
+    return RosTransport(f"ros1:{url.address}", lambda _hub: Ros1Middleware(address), from_parsed(parsed))

@@ -228,7 +228,7 @@ class TcprosListener:
             raise TransportError(f"ros1: can't listen at {bind}: {error}") from error
         self.port: int = self._socket.getsockname()[1]
         self._starting: asyncio.Task[asyncio.Server] | None = None
-        self._closed = False
+        self.closed = False
 
     def start(self) -> None:
         """Accept connections."""
@@ -241,7 +241,7 @@ class TcprosListener:
 
     def close(self) -> None:
         """Stop listening. Connections that were handed on stay."""
-        self._closed = True
+        self.closed = True
         if self._starting is None:
             self._socket.close()
         else:
@@ -251,7 +251,7 @@ class TcprosListener:
 
     def admit(self, connection: TcprosConnection) -> bool:
         """Return whether there is a place for one more connection that has not sent its header."""
-        if self._closed or len(self.pending) >= CONNECTIONS_MAX:
+        if self.closed or len(self.pending) >= CONNECTIONS_MAX:
             self.context.lost[_ADMITTED] += 1
             return False
         self.pending.add(connection)

@@ -1,9 +1,9 @@
 """ROS 1 as the middleware of a link: the master and slave API on one side, TCPROS on the other.
 
-    RosLink  ->  Ros1Middleware  ->  MasterSession            what nodes have, and what others have (XMLRPC)
-                                 ->  Ros1Publication              messages out
-                                 ->  Ros1Server, Ros1Callers  services
-    RosLink  <-  Ros1Subscription    <-  PublisherConnection      messages in
+    RosLink  ->  Ros1Middleware    ->  MasterSession            what nodes have, and what others have (XMLRPC)
+                                   ->  Ros1Publication          messages out
+                                   ->  Ros1Server, Ros1Callers  services
+    RosLink  <-  Ros1Subscription  <-  PublisherConnection      messages in
 
 Each of the link's nodes has a slave server and a TCPROS listener of its own, as a node in a process of its own has.
 Connections go on while the master is gone: it only brings nodes together.
@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 
 from r2p.clock import Backoff
+from r2p.errors import NoServer
 from r2p.ros.middleware import Middleware, MiddlewareUser, RosEndpoint, RosServer, RosService
 from r2p.ros.ros1.connections import Ros1Context, TcprosConnection, TcprosListener
 from r2p.ros.ros1.environment import RosAddress
@@ -181,7 +182,11 @@ class Ros1Middleware(Middleware):
 
     async def call(self, node: str, service: str, type: RosService, request: bytes, timeout: float) -> bytes:
         async with asyncio.timeout(timeout):
-            address = await self._session.find_service(node, service, timeout)
+            try:
+                address = await self._session.find_service(node, service, timeout)
+            except NoServer:
+                self._callers.forget(service)
+                raise
             return await self._callers.call(node, service, type, address, request)
 
     # For the slave API
@@ -207,11 +212,10 @@ class Ros1Middleware(Middleware):
                 yield from map(_incoming, subscription.connections.values())
 
     def _connect(self, subscription: Ros1Subscription) -> None:
-        """Connect to the publishers of a topic that are not in this process."""
+        """Connect to the publishers of a topic."""
         publishers = self._publishers.get((subscription.node, subscription.topic))
         if publishers is not None:
-            own = {self._session.slave_uri(node) for node in self._listeners}
-            subscription.update(uri for uri in publishers if uri not in own)
+            subscription.update(publishers)
 
     async def _ask_keepalive(self) -> None:
         """Do without keep-alive on further connections if the parameter /tcp_keepalive says so."""

@@ -2,7 +2,8 @@
 
 A server handles the requests of one connection in turn, and those of several connections at the same time, as rospy
 does. Calls ask for connections that persist, and keep them for KEEP_S for the next call of the same node: a connection
-costs several times as much as a call. So calls at the same time have a connection each.
+costs several times as much as a call. So calls at the same time have a connection each. Not longer, as rospy goes on
+answering on a connection when the service has another handler or another node serves it.
 """
 
 import asyncio
@@ -27,7 +28,7 @@ from r2p.ros.ros1.tcpros import (
     server_header,
 )
 
-KEEP_S = 5.0
+KEEP_S = 1.0
 """Seconds for which a connection to a server is kept after a call."""
 
 REQUESTS_MAX = 16
@@ -256,6 +257,12 @@ class Ros1Callers:
         fields = await self._answer(connection, service)
         connection.close()
         return RosService(fields.get("type", ""), fields.get("md5sum", ""))
+
+    def forget(self, service: str) -> None:
+        """Close the connections that are kept for a service: nothing serves it now."""
+        for key in [key for key in self._idle if key[1] == service]:
+            for connection in self._idle.pop(key):
+                connection.close()
 
     def close(self) -> None:
         """Close all connections; calls that wait raise ServiceError."""

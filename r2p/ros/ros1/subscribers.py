@@ -20,6 +20,11 @@ CONNECT_S = 5.0
 RETRY_S = 5.0
 """The longest time between two attempts to connect to a publisher."""
 
+REPORT_S = 2.0
+"""Seconds for which a publisher can't be reached until that is counted and reported: one that ends closes its
+connections before the master says so.
+"""
+
 _STABLE_S = 3.0  # seconds; a connection that lived as long was a good one: the next is tried at once
 
 
@@ -66,6 +71,8 @@ class PublisherConnection(TcprosConnection):
         subscription = self._subscription
         refusal = refuse_publisher(fields, subscription.topic, subscription.type)
         if refusal:
+            if "error" in fields:
+                refusal = f"the publisher of [{subscription.topic}] at {self.uri} refuses this node: {refusal}"
             self.context.refuse(subscription.topic, refusal)
             self.close()
             return
@@ -170,17 +177,20 @@ class Ros1Subscription:
 
     async def _follow(self, uri: str) -> None:
         """Connect to a publisher, again and again, until cancelled."""
-        loop = asyncio.get_running_loop()
+        now = asyncio.get_running_loop().time
         backoff = Backoff(self.context.random, longest=RETRY_S)
+        worked_at = now()
         while True:
-            began = loop.time()
+            began = now()
             try:
                 await self._receive_from(uri)
+                worked_at = now()
             except (OSError, XmlRpcError) as error:
-                self._report(uri, error)
-            except Exception as error:  # noqa: BLE001 - reported; the next attempt follows
+                if now() - worked_at >= REPORT_S or isinstance(error, socket.gaierror):
+                    self._report(uri, error)
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next attempt follows
                 self.context.internal_error(error)
-            if loop.time() - began >= _STABLE_S:
+            if now() - began >= _STABLE_S:
                 backoff.reset()
             await asyncio.sleep(backoff.delay())
 

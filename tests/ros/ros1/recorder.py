@@ -1,15 +1,33 @@
-"""A user of a middleware that keeps what it is told, and a socket without a network."""
+"""A middleware with a user that keeps what it is told; and a socket without a network."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from r2p.ros.middleware import Answer, Cancel, MiddlewareUser, Refuse, RosArrival, RosGraph
+from r2p.ros.middleware import (
+    Answer,
+    Cancel,
+    MiddlewareUser,
+    Qos,
+    Refuse,
+    RosArrival,
+    RosEndpoint,
+    RosGraph,
+    RosService,
+    RosType,
+)
+from r2p.ros.ros1.environment import RosAddress
+from r2p.ros.ros1.middleware import Ros1Middleware
+from r2p.ros.ros1.tcpros import frame
+from r2p.transports.stats import LoggedCounter
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
+
+    from tests.ros.ros1.programs import Ros1
 
 
 class Recorder(MiddlewareUser):
@@ -90,6 +108,35 @@ class Recorder(MiddlewareUser):
     def data(self, topic: str) -> list[bytes]:
         """The bytes of the messages that came on a topic."""
         return [each.data for each in self.arrivals if each.topic == topic.encode()]
+
+
+STRING = RosType("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
+INT = RosType("std_msgs/Int32", "da5909fbe378aeaf85e547e830cc1bb7", "int32 data")
+ANY = RosType("*", "*")
+SET_BOOL = RosService("std_srvs/SetBool", "09fb03525b03e7ea1fd3992bafd87e16")
+DONE = b"\1" + frame(b"done")
+QOS = Qos()
+
+
+@contextlib.asynccontextmanager
+async def running(ros1: Ros1, *nodes: str) -> AsyncIterator[tuple[Ros1Middleware, Recorder]]:
+    """A middleware with these nodes, that is registered."""
+    user = Recorder()
+    middleware = Ros1Middleware(RosAddress(ros1.uri, "127.0.0.1", "127.0.0.1"), LoggedCounter("ros1:"))
+    for node in nodes or ("/blink",):
+        middleware.add_node(node)
+    task = asyncio.ensure_future(middleware.run(user, lambda: None))
+    try:
+        await user.until(lambda: ("up",) in user.log)
+        yield middleware, user
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+def talk(topic: str, node: str = "/blink", kind: RosType = STRING, qos: Qos = QOS) -> RosEndpoint:
+    return RosEndpoint(node, topic, kind, qos)
 
 
 class Wire(asyncio.Transport):

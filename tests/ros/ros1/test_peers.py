@@ -1,0 +1,97 @@
+"""r2p as a ROS 1 node among programs that take long to start: Debian's tools, and peers that are killed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import struct
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from r2p.ros.middleware import Qos, RosServer
+from r2p.ros.ros1.tcpros import frame
+from tests.ros.ros1.recorder import ANY, INT, SET_BOOL, running, talk
+
+if TYPE_CHECKING:
+    from tests.ros.ros1.programs import Ros1
+
+pytestmark = [pytest.mark.xdist_group("ros1"), pytest.mark.processes, pytest.mark.anyio]
+
+LIMIT = 30.0
+"""Seconds after which a test has failed."""
+
+
+@pytest.fixture(scope="module")
+def anyio_backend() -> tuple[str, dict[str, Any]]:
+    return "asyncio", {"use_uvloop": True}
+
+
+async def test_tools_of_ros_see_and_use_a_node(ros1: Ros1) -> None:
+    async with running(ros1) as (middleware, user):
+        middleware.advertise(talk("/chat", qos=Qos(transient_local=True)))
+        middleware.subscribe(talk("/in"))
+        middleware.serve(RosServer("/blink", "/set", SET_BOOL))
+        middleware.publish("/blink", "/chat", frame(b"latched"), 0)
+        user.serve = lambda request: b"\1" + frame(b"on" if request == b"\1" else b"off")
+        async with ros1.running("rostopic", "pub", "/in", "std_msgs/String", "hello"):
+            echo, info, call, node = await asyncio.gather(
+                ros1.run("rostopic", "echo", "-n", "1", "/chat"),
+                ros1.run("rosservice", "info", "/set"),
+                ros1.run("rosservice", "call", "/set", "true"),
+                ros1.run("rosnode", "info", "/blink"),
+            )
+            await user.until(lambda: user.data("/in"))
+        assert 'data: "latched"' in echo.output
+        assert "Type: std_srvs/SetBool" in info.output
+        assert 'message: "on"' in call.output
+        assert " * /chat [std_msgs/String]" in node.output
+        assert user.data("/in") == [frame(b"hello")]
+
+
+async def test_the_cpp_relay_and_a_bag_carry_any_type(ros1: Ros1, tmp_path: object) -> None:
+    async with running(ros1) as (middleware, user):
+        middleware.advertise(talk("/numbers", kind=INT))
+        middleware.subscribe(talk("/relayed", kind=ANY))
+        middleware.subscribe(talk("/played", kind=INT))
+        bag = f"{tmp_path}/numbers.bag"
+        async with (
+            ros1.running("topic_tools/relay", "/numbers", "/relayed"),
+            ros1.running("rosbag", "record", "--output-name", bag, "--limit", "5", "/numbers") as record,
+        ):
+            await user.until(lambda: user.log.count(("subscriber joined", "/numbers")) == 2)
+            for number in range(5):
+                middleware.publish("/blink", "/numbers", struct.pack("<i", number), 0)
+            async with asyncio.timeout(LIMIT):
+                await record.wait()
+            # The relay advertises at its first message: what is published until r2p is connected is not for it.
+            while not user.data("/relayed"):
+                middleware.publish("/blink", "/numbers", struct.pack("<i", 7), 0)
+                with contextlib.suppress(TimeoutError):
+                    await user.until(lambda: user.data("/relayed"), 0.05)
+            found = [entry for entry in user.log if entry[:2] == ("publisher found", "/relayed")]
+            assert [entry[3] for entry in found] == ["std_msgs/Int32"]
+        played = await ros1.run("rosbag", "play", "--delay", "1", bag, "/numbers:=/played")
+        assert played.code == 0, played.output
+        await user.until(lambda: len(user.data("/played")) == 5)
+        assert user.data("/played") == [struct.pack("<i", number) for number in range(5)]
+
+
+async def test_peers_that_are_killed_are_replaced_by_new_ones(ros1: Ros1) -> None:
+    async with running(ros1) as (middleware, user):
+        middleware.advertise(talk("/out"))
+        middleware.subscribe(talk("/in"))
+        for attempt in (1, 2):
+            with ros1.peer("mortal") as peer:
+                await peer.do("subscribe", topic="/out", type="std_msgs/String")
+                await peer.do("advertise", topic="/in", type="std_msgs/String", latch=True)
+                await peer.do("publish", topic="/in", fields={"data": str(attempt)})
+                await user.until(lambda: len(user.data("/in")) == attempt)  # noqa: B023
+                await user.until(lambda: user.log.count(("subscriber joined", "/out")) == attempt)  # noqa: B023
+                middleware.publish("/blink", "/out", frame(b"hello"), 0)
+                await peer.do("messages", topic="/out")
+                peer.kill()
+                await user.until(lambda: user.log.count(("subscribers gone", "/out")) == attempt)  # noqa: B023
+                await user.until(lambda: user.log.count(("publisher gone", "/in", "/mortal")) == attempt)  # noqa: B023
+        await user.until(lambda: "no connection: /in" in user.notices)
+        assert "rosnode cleanup" in user.notices["no connection: /in"]
