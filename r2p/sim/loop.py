@@ -8,6 +8,7 @@ in asyncio that goes through the loop works unchanged. These things are outside 
 - A task that never waits, such as one that publishes in a loop, would stop time, and so would a descriptor that is
   always ready: after 100 000 iterations of the loop at one instant the next timer runs anyway.
 - Real file descriptors are polled, but not waited for: time goes on without them. Don't use sockets and devices.
+  With a paced clock (`speed`, `follow`) they are waited for, and work: time goes no faster than other programs' time.
 - `time.time`, `time.sleep`, `random` and the order of sets of strings stay real: use `r2p.clock` instead of the first
   three.
 """
@@ -24,8 +25,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar, TypeVarTuple, Unpack
 
 from r2p.clock import SystemClock, check_timeout
-from r2p.errors import Deadlock
+from r2p.errors import Deadlock, MessageError
 from r2p.modules.unwinding import frames
+from r2p.sim.clocks import FollowingClock, PacedClock, VirtualClock
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
@@ -36,7 +38,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
-_EPOCH: Final = 1_356_998_400 * SECOND  # 2013-01-01T00:00:00Z
 _HORIZON: Final = float(2**22)  # seconds, 48 days: up to here there are two floats for each nanosecond
 _END: Final = 2**22 * SECOND  # the same in ns
 _RESOLUTION: Final = 0.4e-9  # seconds: less than a nanosecond, and more than the rounding error at the horizon
@@ -47,11 +48,17 @@ _IDLE_CHECK: Final = 5 * SECOND  # between two checks whether a task has been wo
 _BUSY: Final = 100_000  # iterations of the loop at one instant, after which the next timer runs anyway
 _AHEAD: Final = 1000  # events in one iteration of the loop: signals and real file descriptors wait for so long
 _POLL_EVERY: Final = 64  # iterations between two polls of asyncio's own descriptor, which signals wake
+_SLOWEST, _FASTEST = 0.001, 10_000.0  # times real time
 _REAL: Final = SystemClock()  # only measures the real time until a Deadlock
 
 
 def run(
-    main: Coroutine[Any, Any, T] | Callable[[], Coroutine[Any, Any, T]], *, seed: int = 0, limit: float | None = None
+    main: Coroutine[Any, Any, T] | Callable[[], Coroutine[Any, Any, T]],
+    *,
+    seed: int = 0,
+    limit: float | None = None,
+    speed: float | None = None,
+    follow: bool = False,
 ) -> T:
     """Run `main` (a coroutine, or a function that makes one) under virtual time, and return its result.
 
@@ -62,32 +69,33 @@ def run(
     Timers that only repeat themselves (announcements, periodic publishers, time-outs that no task waits for) do not
     keep a program alive: Deadlock is raised when they have woken no task for half a second of real time and 20 seconds
     of virtual time. Where nodes exchange messages forever, `limit` raises it after this many seconds of virtual time.
+
+    With a `speed`, virtual time goes that many times as fast as real time, so that other programs take part: links to
+    other processes work, and those to ROS publish the time as `/clock`. With `follow` it is the other way round: the
+    time is that of the `/clock` of ROS, and real time without one. Both wait for other programs, so there is no
+    Deadlock but that of the limit.
     """
     check_timeout("the limit", limit)
-    with asyncio.Runner(loop_factory=lambda: VirtualLoop(seed=seed, limit=limit)) as runner:
+    clock = clock_for(speed, follow=follow)
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(seed=seed, limit=limit, clock=clock)) as runner:
         return runner.run(main() if callable(main) else main)
+
+
+def clock_for(speed: float | None, *, follow: bool) -> VirtualClock:
+    """Return the clock for a speed, and for following another one, as `run` has them. Raises MessageError."""
+    if follow:
+        if speed is not None:
+            raise MessageError("either a speed or follow=True: a clock that follows another one has that one's speed")
+        return FollowingClock()
+    if speed is None:
+        return VirtualClock()
+    if not _SLOWEST <= speed <= _FASTEST:
+        raise MessageError(f"the speed is how many times as fast as real time, {_SLOWEST} to {_FASTEST}, not {speed!r}")
+    return PacedClock(speed)
 
 
 Event: TypeAlias = tuple[int, int, Callable[..., object], tuple[Any, ...]]
 """Time (ns since the start), order within one instant, function and arguments of a call."""
-
-
-class VirtualClock:
-    """The clock of a `VirtualLoop`: an integer, moved by the loop. Satisfies `r2p.clock.Clock`."""
-
-    virtual = True
-
-    def __init__(self) -> None:
-        self.elapsed = 0
-        """Ns since the start; set by the loop."""
-
-    def now(self) -> int:
-        """Return UTC in ns; it starts at 2013-01-01."""
-        return _EPOCH + self.elapsed
-
-    def monotonic(self) -> int:
-        """Return the ns since the start."""
-        return self.elapsed
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
@@ -97,13 +105,13 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     _scheduled: list[asyncio.TimerHandle]  # asyncio's heap of timers; when it polls, the first one is not cancelled
     _clock_resolution: float  # asyncio runs timers that are due this much later, too
 
-    def __init__(self, *, seed: int = 0, limit: float | None = None) -> None:
-        super().__init__(_Selector(self._idle, self._turn))
+    def __init__(self, *, seed: int = 0, limit: float | None = None, clock: VirtualClock | None = None) -> None:
+        self.clock = VirtualClock() if clock is None else clock
+        super().__init__(_Selector(self._idle, self._turn, self._advance if self.clock.paced else None))
         self._end = _HORIZON if limit is None else min(limit, _HORIZON)  # s
         self._checked = 0  # ns: the last check for tasks that were woken, or the last timer not in the background
         self._waited_for: dict[asyncio.Task[Any], object] | None = None  # what each task waited for at that check
         self._alive = self._alive_really = 0  # ns: since when no task has been woken; the same in real time
-        self.clock = VirtualClock()
         self.random = random.Random(seed)
         self.task_numbers = itertools.count(1)
         self._timer_numbers = itertools.count()
@@ -165,7 +173,10 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         itself. An event in the past runs now. After 1000 events the loop continues, also if nothing else is due.
         """
         ready, clock = self._ready, self.clock
-        self._limit = 0 if self._jobs else self._next_timer()
+        if clock.paced:
+            self._limit = min(self._next_timer(), clock.limit() + 1)
+        else:
+            self._limit = 0 if self._jobs else self._next_timer()
         for _ in range(_AHEAD):
             if not events:
                 return
@@ -188,15 +199,24 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         if self._instant != self.clock.elapsed:
             self._instant, self._turns = self.clock.elapsed, 0
         self._turns += 1
-        if self._turns >= _BUSY and self._scheduled and not self._jobs:
+        if self._turns >= _BUSY and self._scheduled and not self._jobs and not self.clock.paced:
             when = self._scheduled[0].when()
             if when < _HORIZON:
                 self.clock.elapsed = max(self.clock.elapsed, _nanoseconds(when))
 
-    def _idle(self) -> bool:
-        """Jump to the next timer: nothing is left to do at this instant. True: wait for a job in a thread instead."""
+    def _advance(self) -> None:
+        """Let the time of a paced clock pass, up to the next timer."""
+        self.clock.advance(min(self._next_timer(), _nanoseconds(self._end)))
+
+    def _idle(self) -> float | None:
+        """Jump to the next timer: nothing is left to do at this instant. Return for how long to wait, None: for events.
+
+        With a free clock, only jobs in threads are waited for.
+        """
+        if self.clock.paced:
+            return self._paced_idle()
         if self._jobs:
-            return True
+            return None
         timer = self._scheduled[0] if self._scheduled else None
         if timer is None or timer.when() >= self._end:
             self._give_up(timer is not None)
@@ -207,7 +227,16 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         elif instant - self._checked >= _IDLE_CHECK:
             self._check_progress(instant)
         self.clock.elapsed = instant
-        return False
+        return 0.0
+
+    def _paced_idle(self) -> float | None:
+        self._advance()
+        instant = self._next_timer()
+        if self.clock.elapsed >= _nanoseconds(self._end):
+            self._give_up(True)
+        if instant <= self.clock.elapsed:
+            return 0.0
+        return None if instant >= _END else self.clock.delay(instant)
 
     def _give_up(self, later: bool) -> NoReturn:
         if not later:
@@ -254,12 +283,15 @@ def _in_background(timer: asyncio.TimerHandle) -> bool:
 
 
 class _Selector(selectors.DefaultSelector):
-    """A selector that does not wait while virtual time can go on instead."""
+    """A selector that does not wait while virtual time can go on instead; `advance` lets that of paced clocks pass."""
 
-    def __init__(self, idle: Callable[[], bool], turn: Callable[[], None]) -> None:
+    def __init__(
+        self, idle: Callable[[], float | None], turn: Callable[[], None], advance: Callable[[], None] | None
+    ) -> None:
         super().__init__()
         self._idle = idle
         self._turn = turn
+        self._advance = advance
         self._selects = itertools.count()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
@@ -267,12 +299,20 @@ class _Selector(selectors.DefaultSelector):
         if len(self.get_map()) > 1 or not next(self._selects) % _POLL_EVERY:
             events = super().select(0)
             if events:
+                if self._advance is not None:
+                    self._advance()
                 self._turn()
                 return events
         if timeout == 0:  # callbacks are ready
             self._turn()
             return []
-        return super().select(None) if self._idle() else []
+        wait = self._idle()
+        if wait == 0.0:
+            return []
+        events = super().select(wait)
+        if self._advance is not None:
+            self._advance()
+        return events
 
 
 class _VirtualTimer(asyncio.TimerHandle):

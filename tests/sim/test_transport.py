@@ -12,7 +12,8 @@ import r2p.sim
 from r2p.clock import clock_of
 from r2p.msg import PWM2, Led
 from r2p.sim.can import FrameRecord
-from r2p.sim.loop import VirtualClock, VirtualLoop
+from r2p.sim.clocks import VirtualClock
+from r2p.sim.loop import VirtualLoop
 from r2p.testing.network import node_in
 from r2p.transports.url import open_transport
 

@@ -1,0 +1,115 @@
+"""The clocks of virtual time: free, at a steady speed, or after another clock.
+
+A free `VirtualClock` jumps to the next timer. A `PacedClock` goes no faster than so many times real time, so that other
+programs take part: real sockets and devices work, and ROS nodes that follow its `/clock`. A `FollowingClock` does what
+other programs do there: it shows the time that it is given, and stands still in between.
+"""
+
+import logging
+from collections.abc import Callable
+from typing import Final
+
+from r2p.clock import SystemClock
+from r2p.units import SECOND
+
+logger = logging.getLogger("r2p.clock")
+
+_SYSTEM: Final = SystemClock()
+_EPOCH: Final = 1_356_998_400 * SECOND  # 2013-01-01T00:00:00Z
+_LAG: Final = (
+    SECOND // 10
+)  # ns of real time by which a paced clock may be late, and makes up for it; what is more is lost
+_JUMP: Final = 10 * SECOND  # by which a clock may go on at once, with all timers until then; beyond it is set anew
+
+
+class VirtualClock:
+    """The clock of a `VirtualLoop`: an integer, moved by the loop. Satisfies `r2p.clock.Clock`."""
+
+    virtual = True
+    paced = False
+    """True if time waits for real time, and so for other programs."""
+
+    def __init__(self) -> None:
+        self.elapsed = 0
+        """Ns since the start; set by the loop."""
+        self.epoch = _EPOCH
+        """UTC at the start, ns."""
+
+    def now(self) -> int:
+        """Return UTC in ns; it starts at 2013-01-01."""
+        return self.epoch + self.elapsed
+
+    def monotonic(self) -> int:
+        """Return the ns since the start."""
+        return self.elapsed
+
+    def limit(self) -> int:
+        """Return how far time may have gone now (ns since the start)."""
+        return self.elapsed
+
+    def delay(self, instant: int) -> float | None:
+        """Return the real seconds until time may have gone to an instant; None: that depends on other programs."""
+        return 0.0
+
+    def advance(self, latest: int) -> None:
+        """Let time go on as far as it may have gone now, but not beyond `latest`."""
+
+
+class PacedClock(VirtualClock):
+    """Virtual time that goes `speed` times as fast as real time, and slower where the computer can't keep up."""
+
+    paced = True
+
+    def __init__(self, speed: float, real: Callable[[], int] = _SYSTEM.monotonic) -> None:
+        super().__init__()
+        self._speed = speed
+        self._real = real
+        self._anchor = (real(), 0)  # a real instant, and the virtual one that belongs to it
+
+    def limit(self) -> int:
+        real, elapsed = self._anchor
+        return elapsed + round((self._real() - real) * self._speed)
+
+    def delay(self, instant: int) -> float | None:
+        return max(0, instant - self.limit()) / self._speed / SECOND
+
+    def advance(self, latest: int) -> None:
+        limit = self.limit()
+        self.elapsed = max(self.elapsed, min(limit, latest))
+        lag = round(_LAG * self._speed)
+        if limit - self.elapsed > lag:
+            self._anchor = self._real(), self.elapsed + lag
+
+
+class FollowingClock(PacedClock):
+    """The time of another clock, such as that of a simulator of ROS; real time while there is none.
+
+    Between two times it stands still. When the other clock goes back, or far ahead, this one takes its time from there
+    on: no timer goes off for the time that is left out.
+    """
+
+    def __init__(self, real: Callable[[], int] = _SYSTEM.monotonic) -> None:
+        super().__init__(1.0, real)
+        self.epoch = _SYSTEM.now()
+        self._followed: int | None = None
+
+    def follow(self, utc: int) -> None:
+        """Go on to this time (ns since 1970)."""
+        elapsed = utc - self.epoch
+        if self._followed is None or not 0 <= elapsed - self.elapsed <= _JUMP:
+            if self._followed is not None:
+                logger.warning("the time that is followed went %.1f s at once", (elapsed - self._followed) / SECOND)
+            self.epoch, elapsed = utc - self.elapsed, self.elapsed
+        self._followed = elapsed
+
+    def release(self) -> None:
+        """Go on with real time: the other clock is gone."""
+        if self._followed is not None:
+            self._followed = None
+            self._anchor = self._real(), self.elapsed
+
+    def limit(self) -> int:
+        return super().limit() if self._followed is None else self._followed
+
+    def delay(self, instant: int) -> float | None:
+        return super().delay(instant) if self._followed is None else None
