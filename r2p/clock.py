@@ -19,7 +19,7 @@ import random
 import re
 import sys
 import time
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeGuard
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeGuard, runtime_checkable
 
 from r2p.errors import MessageError
 from r2p.units import MILLISECOND, SECOND
@@ -56,6 +56,14 @@ class Clock(Protocol):
 
     def monotonic(self) -> int:
         """Ns since an arbitrary instant; cannot be set: for deadlines and intervals."""
+
+
+@runtime_checkable
+class SteeredClock(Clock, Protocol):
+    """A clock that goes on with the times that it is given, such as those of a simulator."""
+
+    def follow(self, utc: int, alive: Callable[[], bool]) -> None:
+        """Go on to this time (ns since 1970); with real time as soon as `alive()` is false: the other clock is gone."""
 
 
 class SystemClock:

@@ -5,9 +5,9 @@
 runs the coroutine function `main` under virtual time: a day of sleeping takes no time, and two runs with the same seed
 are the same.
 
-`loop` is virtual time. `transport` puts modules on a simulated bus (`sim:NAME`), which `can` models bit by bit.
-`modules` emulates firmware and the hardware modules of the thesis, around the models of `physics`; `robots` assembles
-them to a robot.
+`loop` is virtual time, and `clocks` say how it passes. `transport` puts modules on a simulated bus (`sim:NAME`), which
+`can` models bit by bit. `modules` emulates firmware and the hardware modules of the thesis, around the models of
+`physics`; `robots` assembles them to a robot.
 """
 
 from r2p.sim.loop import VirtualLoop, run

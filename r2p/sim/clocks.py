@@ -19,6 +19,7 @@ _EPOCH: Final = 1_356_998_400 * SECOND  # 2013-01-01T00:00:00Z
 _LAG: Final = (
     SECOND // 10
 )  # ns of real time by which a paced clock may be late, and makes up for it; what is more is lost
+_LOOK_EVERY: Final = 0.5  # s of real time between two looks whether the clock that is followed is still there
 _JUMP: Final = 10 * SECOND  # by which a clock may go on at once, with all timers until then; beyond it is set anew
 
 
@@ -47,8 +48,8 @@ class VirtualClock:
         """Return how far time may have gone now (ns since the start)."""
         return self.elapsed
 
-    def delay(self, instant: int) -> float | None:
-        """Return the real seconds until time may have gone to an instant; None: that depends on other programs."""
+    def delay(self, instant: int) -> float:
+        """Return the real seconds until time may have gone to an instant, or until it is to be asked again."""
         return 0.0
 
     def advance(self, latest: int) -> None:
@@ -70,7 +71,7 @@ class PacedClock(VirtualClock):
         real, elapsed = self._anchor
         return elapsed + round((self._real() - real) * self._speed)
 
-    def delay(self, instant: int) -> float | None:
+    def delay(self, instant: int) -> float:
         return max(0, instant - self.limit()) / self._speed / SECOND
 
     def advance(self, latest: int) -> None:
@@ -92,24 +93,29 @@ class FollowingClock(PacedClock):
         super().__init__(1.0, real)
         self.epoch = _SYSTEM.now()
         self._followed: int | None = None
+        self._alive: Callable[[], bool] = bool
 
-    def follow(self, utc: int) -> None:
-        """Go on to this time (ns since 1970)."""
+    def follow(self, utc: int, alive: Callable[[], bool]) -> None:
+        """Go on to this time (ns since 1970); with real time as soon as `alive()` is false: the other clock is gone."""
         elapsed = utc - self.epoch
         if self._followed is None or not 0 <= elapsed - self.elapsed <= _JUMP:
-            if self._followed is not None:
-                logger.warning("the time that is followed went %.1f s at once", (elapsed - self._followed) / SECOND)
+            jump = elapsed - self.elapsed
+            logger.info("the time is now that of /clock, which is %+.1f s from here", jump / SECOND)
             self.epoch, elapsed = utc - self.elapsed, self.elapsed
-        self._followed = elapsed
+        self._followed, self._alive = elapsed, alive
 
     def release(self) -> None:
-        """Go on with real time: the other clock is gone."""
-        if self._followed is not None:
-            self._followed = None
-            self._anchor = self._real(), self.elapsed
+        """Go on with real time."""
+        self._followed = None
+        self._anchor = self._real(), self.elapsed
 
     def limit(self) -> int:
         return super().limit() if self._followed is None else self._followed
 
-    def delay(self, instant: int) -> float | None:
-        return super().delay(instant) if self._followed is None else None
+    def delay(self, instant: int) -> float:
+        if self._followed is not None and self._alive():
+            return _LOOK_EVERY
+        if self._followed is not None:
+            logger.warning("/clock has no publisher any more: time goes on by the computer's clock until it has")
+            self.release()
+        return super().delay(instant)

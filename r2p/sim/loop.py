@@ -48,6 +48,7 @@ _IDLE_CHECK: Final = 5 * SECOND  # between two checks whether a task has been wo
 _BUSY: Final = 100_000  # iterations of the loop at one instant, after which the next timer runs anyway
 _AHEAD: Final = 1000  # events in one iteration of the loop: signals and real file descriptors wait for so long
 _POLL_EVERY: Final = 64  # iterations between two polls of asyncio's own descriptor, which signals wake
+_LONGEST_WAIT: Final = 3600.0  # s: no poll takes much longer ones
 _SLOWEST, _FASTEST = 0.001, 10_000.0  # times real time
 _REAL: Final = SystemClock()  # only measures the real time until a Deadlock
 
@@ -229,14 +230,12 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self.clock.elapsed = instant
         return 0.0
 
-    def _paced_idle(self) -> float | None:
+    def _paced_idle(self) -> float:
         self._advance()
-        instant = self._next_timer()
-        if self.clock.elapsed >= _nanoseconds(self._end):
+        instant, end = self._next_timer(), _nanoseconds(self._end)
+        if self.clock.elapsed >= end:
             self._give_up(True)
-        if instant <= self.clock.elapsed:
-            return 0.0
-        return None if instant >= _END else self.clock.delay(instant)
+        return 0.0 if instant <= self.clock.elapsed else min(self.clock.delay(min(instant, end)), _LONGEST_WAIT)
 
     def _give_up(self, later: bool) -> NoReturn:
         if not later:
@@ -295,23 +294,25 @@ class _Selector(selectors.DefaultSelector):
         self._selects = itertools.count()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if self._advance is not None:
+            return self._select_paced(timeout, self._advance)
         # A system call for each iteration would take most of the time; alone, asyncio's own descriptor can wait.
         if len(self.get_map()) > 1 or not next(self._selects) % _POLL_EVERY:
             events = super().select(0)
             if events:
-                if self._advance is not None:
-                    self._advance()
                 self._turn()
                 return events
         if timeout == 0:  # callbacks are ready
             self._turn()
             return []
-        wait = self._idle()
-        if wait == 0.0:
-            return []
-        events = super().select(wait)
-        if self._advance is not None:
-            self._advance()
+        return super().select(None) if self._idle() is None else []
+
+    def _select_paced(
+        self, timeout: float | None, advance: Callable[[], None]
+    ) -> list[tuple[selectors.SelectorKey, int]]:
+        events = super().select(0 if timeout == 0 else self._idle())
+        advance()
+        self._turn()
         return events
 
 

@@ -175,10 +175,10 @@ class BusyLoop(VirtualLoop):
         super().__init__(seed=1)
         self.clock = WallClock(self.random)
 
-    def _idle(self) -> bool:
-        waits = super()._idle()
+    def _idle(self) -> float | None:
+        wait = super()._idle()
         self.clock.elapsed += self.random.randrange(self.LATEST)
-        return waits
+        return wait
 
 
 def test_paced_to_real_time() -> None:

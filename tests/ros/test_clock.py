@@ -1,0 +1,63 @@
+"""The time of a ROS network: published by a program under virtual time, and followed by one."""
+
+import asyncio
+import itertools
+
+import pytest
+
+import r2p
+import r2p.sim
+from r2p.messages import Timestamp
+from r2p.ros.clock import RosClock
+from r2p.testing.network import node_in
+from r2p.units import MILLISECOND, SECOND
+from tests.ros.fake import FakeRosNetwork
+
+both = pytest.mark.parametrize("version", [1, 2])
+SIMULATED = 100 * SECOND
+
+
+@both
+def test_virtual_time_is_the_time_of_ros_nodes(version: int) -> None:
+    async def main() -> list[RosClock]:
+        network = FakeRosNetwork(version)
+        times: list[RosClock] = network.node("/listener").subscribe("/clock", RosClock)
+        async with r2p.Module("PC1", via=[network.transport(), FakeRosNetwork(3 - version).transport()]):
+            await asyncio.sleep(0.5)
+        return times
+
+    times = [each.clock.ns for each in r2p.sim.run(main, speed=100)]
+    assert len(times) > 40
+    assert {later - time for time, later in itertools.pairwise(times)} == {10 * MILLISECOND}
+
+
+@both
+@pytest.mark.virtual_time
+async def test_free_virtual_time_is_not_published(version: int) -> None:
+    """Nothing real could keep up with it."""
+    network = FakeRosNetwork(version)
+    async with r2p.Module("PC1", via=network.transport()):
+        await asyncio.sleep(0.5)
+        assert "/clock" not in {each.topic for each in network.graph().publishers}
+
+
+@both
+def test_a_program_follows_the_time_of_ros(version: int) -> None:
+    async def main() -> None:
+        network = FakeRosNetwork(version)
+        simulator = network.node("/simulator")
+        async with r2p.Module("PC1", via=network.transport()) as module, node_in(module) as node:
+            simulator.publish("/clock", RosClock(Timestamp.from_ns(SIMULATED)))
+            while node.now() != SIMULATED:
+                await asyncio.sleep(0)
+                simulator.publish("/clock", RosClock(Timestamp.from_ns(SIMULATED)))
+            ticks = node.every(1.0)
+            for second in (1, 2, 3):
+                simulator.publish("/clock", RosClock(Timestamp.from_ns(SIMULATED + second * SECOND)))
+                await anext(ticks)
+                assert node.now() == SIMULATED + second * SECOND
+            simulator.close()
+            await asyncio.sleep(0.05)  # real time again
+            assert node.now() > SIMULATED + 3 * SECOND
+
+    r2p.sim.run(main, follow=True)
