@@ -20,7 +20,7 @@ def test_every_dependency_has_a_notice() -> None:
     named = {package: needed for package, _, needed in _ROW.findall((ROOT / NOTICES).read_text())}
     extras = {extra: _packages(each) for extra, each in PROJECT["optional-dependencies"].items() if extra != "all"}
     assert set(named) == _packages(PROJECT["dependencies"]).union(*extras.values())
-    assert all(named[package] == f"`r2p[{extra}]`" for extra, packages in extras.items() for package in packages)
+    assert all(f"`r2p[{extra}]`" in named[package] for extra, packages in extras.items() for package in packages)
 
 
 def test_the_wheel_takes_them_along() -> None:

@@ -61,7 +61,7 @@ def parse_options(url: Url) -> ZenohOptions:
     endpoint = url.address or None
     if endpoint is not None:
         try:
-            _endpoint_text(endpoint)
+            endpoint_text(endpoint)
         except ValueError as error:
             raise TransportError(f"{url}: {error}") from None
     mode = given.get("mode") or _default_mode(endpoint, given.get("config"))
@@ -140,7 +140,8 @@ def _file_name(text: str) -> str:
     return text
 
 
-def _endpoint_text(text: str) -> str:
+def endpoint_text(text: str) -> str:
+    """Return a valid endpoint of zenoh, `tcp/router:7447`. Raises ValueError."""
     protocol, _, address = text.partition("/")
     if not address:
         raise ValueError(f"{text!r} is not a zenoh endpoint: give it as tcp/ADDRESS:PORT or tls/ADDRESS:PORT")
@@ -157,7 +158,7 @@ def _endpoint_text(text: str) -> str:
 
 _PARSERS: dict[str, Callable[[str], Any]] = {
     "mode": _one_of(*MODES),
-    "listen": _endpoint_text,
+    "listen": endpoint_text,
     "network": _network_name,
     "scouting": _one_of("on", "off"),
     "batching": _one_of("on", "off"),

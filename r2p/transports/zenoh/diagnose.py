@@ -19,6 +19,9 @@ _HANDSHAKE_TIMEOUT_S = 1.0  # seconds for a server that speaks TLS to answer in 
 NOT_ADMITTED = "accepts the connection, but not this module"
 """Part of a text that is also true for a moment after a router's return, until zenoh tries again."""
 
+NOTHING_LISTENS = "no program listens at"
+"""The beginning of a text that says so."""
+
 _STREAMS = {"tcp", "tls", "ws"}
 _DATAGRAMS = {"udp", "quic"}
 
@@ -160,7 +163,7 @@ async def _diagnose_endpoint(text: str, settings: ConnectionSettings) -> str:
     except ssl.SSLError as error:
         return f"{address}: {_tls_text(error, settings.tls)}"
     except ConnectionRefusedError:
-        return f"no program listens at {address}: is the router running, is the port the right one?"
+        return f"{NOTHING_LISTENS} {address}: is the router running, is the port the right one?"
     except (OSError, OverflowError) as error:
         return f"{address}: {error}"
     return f"{address} {NOT_ADMITTED}: {_not_admitted_text(server.kind, settings)}"

@@ -206,6 +206,11 @@ class ZenohSession:
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._token_count = 0
 
+    @property
+    def raw(self) -> zenoh.Session:
+        """The session itself, for declarations that are not r2p's."""
+        return self._session
+
     def watch_transports(self, queue: LoopQueue) -> None:
         """Report each transport to another session, open ones included: (its id, whether it opened, and whether it uses
         shared memory).
@@ -216,7 +221,7 @@ class ZenohSession:
             queue.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT, bool(shared)))
 
         events: FifoChannel[zenoh.TransportEvent] = FifoChannel(_CHANNEL_MAX)
-        self._forward(self._session.info.declare_transport_events_listener(events, history=True), changed, queue)
+        self.forward(self._session.info.declare_transport_events_listener(events, history=True), changed, queue)
 
     def watch_tokens(self, prefix: str, queue: LoopQueue) -> None:
         """Report each token under a prefix, present ones included: (rest of its key, whether it exists)."""
@@ -230,7 +235,7 @@ class ZenohSession:
 
         tokens: FifoChannel[zenoh.Sample] = FifoChannel(_CHANNEL_MAX)
         declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
-        self._forward(declared, changed, queue)
+        self.forward(declared, changed, queue)
 
     def query_tokens(self, prefix: str, timeout: float, queue: LoopQueue) -> None:
         """Query the tokens under a watched prefix: the rest of each key, and finally whether these are all. A thread of
@@ -274,7 +279,7 @@ class ZenohSession:
 
         messages: FifoChannel[zenoh.Sample] = FifoChannel(_CHANNEL_MAX)
         declared = self._session.declare_subscriber(key, messages, allowed_origin=zenoh.Locality.REMOTE)
-        self._forward(declared, arrived, queue)
+        self.forward(declared, arrived, queue)
 
     def answer_queries(
         self, key: str, answer: Callable[[str], bytes | None], make_queue: Callable[[Callable[[Any], None]], LoopQueue]
@@ -291,10 +296,10 @@ class ZenohSession:
 
         queue = make_queue(reply)
         queries: FifoChannel[zenoh.Query] = FifoChannel(_CHANNEL_MAX)
-        self._forward(self._session.declare_queryable(key, queries), queue.put, queue)
+        self.forward(self._session.declare_queryable(key, queries), queue.put, queue)
 
-    def _forward(self, declared: Any, put: Callable[[Any], object], queue: LoopQueue) -> None:
-        """Call `put` in a thread with each item."""
+    def forward(self, declared: Any, put: Callable[[Any], object], queue: LoopQueue) -> None:
+        """Call `put` in a thread with each item of what was declared with a channel; `queue` counts its errors."""
 
         def listen() -> None:
             receive = declared.handler.recv
@@ -310,6 +315,11 @@ class ZenohSession:
 
         self._declared.append(declared)
         threads.start_thread(listen, "listener")
+
+    def undeclare(self, declared: Any) -> None:
+        """End what was given to `forward`."""
+        self._declared.remove(declared)
+        declared.undeclare()
 
     def subscribe(self, key: str, most: int, on_sample: Callable[[zenoh.Sample], None]) -> SubscriptionReader:
         """Call `on_sample` in the loop with the first sample; later ones are received from the reader. Of more than

@@ -173,7 +173,7 @@ async def test_what_raises_does_not_stop_what_comes_behind_it() -> None:
 
     channel, nothing = Channel(), None
     session = ZenohSession(nothing, losses.internal_error)  # type: ignore[arg-type]
-    session._forward(channel, lambda item: queue.put(len(item)), queue)
+    session.forward(channel, lambda item: queue.put(len(item)), queue)
     channel.put_all(["12345", 7, "1234567890"])
     await ended.wait()
     channel.undeclare()

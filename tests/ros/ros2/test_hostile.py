@@ -1,0 +1,83 @@
+"""Whatever other programs send by zenoh, nothing raises, and what is of no use is counted."""
+
+import pytest
+
+from r2p.ros.ros2.graph import TOKENS_MAX, TokenGraph
+from r2p.ros.ros2.keys import data_key, dds_type, decode_attachment, encode_attachment
+from r2p.transports.stats import LoggedCounter
+from tests.ros.ros2.network import STRING, endpoint, joined, router
+from tests.ros.ros2.recorded import SESSION, recorded
+
+KEY = data_key(0, "/accept", dds_type(STRING.name), STRING.checksum)
+TOKEN = f"@ros2_lv/0/{SESSION}/1/%d/MS/%%/%%/peer/%%accept/{KEY.split('/', 2)[2]}/::,10:,:,:,,"
+
+
+@pytest.mark.anyio
+async def test_recorded_messages() -> None:
+    """Messages that the SDK delivers arrive here, with three differences.
+
+    Those without a valid attachment are counted as lost, as rmw_zenoh drops them. The payload is not looked at here:
+    what the SDK can't decode arrives. And a number or a time below 0 is none.
+    """
+    expected, unusable = [], 0
+    async with router() as network, joined(network, "/here") as (a, user):
+        a.subscribe(endpoint("/here", "/accept"))
+        with network.plain_session() as session:
+            publisher = session.declare_publisher(KEY)
+            await user.until(lambda: publisher.matching_status)
+            for case in recorded()["subscriber_accepts"]:
+                header = None if case["attachment"] is None else bytes.fromhex(case["attachment"])
+                if case["payload"] is None:
+                    session.delete(case["key"])
+                    unusable += 1
+                    continue
+                session.put(case["key"], bytes.fromhex(case["payload"]), attachment=header)
+                if case["key"] != KEY:
+                    continue  # never gets here: not into the SDK either
+                if case["note"] in ("empty attachment", "short attachment", "gid length larger than the rest"):
+                    unusable += 1
+                else:
+                    expected.append((bytes.fromhex(case["payload"]), max(decode_attachment(header or b"")[0], 0)))
+            publisher.put(b"end", attachment=encode_attachment(9, 0, bytes(16)))
+            await user.until(lambda: user.arrivals and user.arrivals[-1].data == b"end")
+        assert [(each.data, each.sequence) for each in user.arrivals[:-1]] == expected
+        assert {each.node for each in user.arrivals} == {""}
+        assert a.lost == {"wrong attachment": 3, "not a message": 1}
+        assert unusable == 4
+
+
+@pytest.mark.anyio
+async def test_tokens() -> None:
+    """Odd tokens are counted, and the graph has what the others stand for; a node of the same name is reported."""
+    async with router() as network, joined(network, "/here") as (a, user):
+        a.advertise(endpoint("/here", "/accept"))
+        with network.plain_session() as session:
+            odd = [f"@ros2_lv/0/{each}" for each in ("x", "x/1/1/NN/%/%/a", f"{SESSION}/1/1/QQ/%/%/a", "é" * 3000)]
+            odd += [(TOKEN % 7).replace("::,10:,:,:,,", qos) for qos in ("nonsense", "::,99999999999999999999:,:,:,,")]
+            odd += [(TOKEN % 8).replace("/peer/", "/9peer/"), (TOKEN % 9).replace("%accept", "%a%%b")]
+            good = [TOKEN % 1, TOKEN % 2 + "/backends", f"@ros2_lv/0/{SESSION}/1/1/NN/%/%/here"]
+            tokens = [session.liveliness().declare_token(each) for each in odd + good]
+            await user.until(lambda: a.lost["wrong token"] == len(odd) and len(user.graph.subscribers) == 2)
+            assert user.graph.nodes == {"/peer", "/here"}
+            (text,) = user.notices
+            assert text == "there is another ROS node /here: tools can't tell the two apart, so rename one of them"
+            # Without a subscriber for the token: it is reported all the same, after a second.
+            await user.until(lambda: "joined /accept" in user.events)
+            del tokens
+        await user.until(lambda: not user.graph.nodes and "gone /accept" in user.events)
+        a.advertise(endpoint("/here", "/1st"))
+        assert "/1st is not on ROS 2" in user.notices[-1]
+
+
+def test_too_many_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("r2p.ros.ros2.graph.TOKENS_MAX", 2)
+    lost = LoggedCounter()
+    graph = TokenGraph("ab", lost)
+    for number in range(4):
+        graph.add(TOKEN % number)
+    assert (len(graph), lost["too many tokens"], TOKENS_MAX > 2) == (2, 2, True)
+    graph.remove(TOKEN % 0)
+    assert graph.add(TOKEN % 3) is not None
+    assert graph.add((TOKEN % 4).replace(SESSION, "ab")) is None  # its own
+    graph.clear()
+    assert len(graph.snapshot().nodes) == 0
