@@ -11,9 +11,22 @@ library       the definitions that come with ROS, and what the ends of a connect
 source        Python source of message classes
 packages      packages for ROS with the types of r2p's classes
 service_types   types of services in ROS; std_srvs: those that every ROS has
-action_types    types of actions
+services        services between r2p and ROS nodes; service_calls: from a request to its answer
+action_types    types of actions; action_server and action_client: the two ends
 """
 
-from r2p.ros.action_types import Action
+from r2p.ros.action_client import ActionClient, ClientGoal
+from r2p.ros.action_server import ActionServer, ServerGoal
+from r2p.ros.action_types import Action, GoalAborted, GoalCanceled, GoalRejected, GoalState
 
-__all__ = ["Action"]
+__all__ = [
+    "Action",
+    "ActionClient",
+    "ActionServer",
+    "ClientGoal",
+    "GoalAborted",
+    "GoalCanceled",
+    "GoalRejected",
+    "GoalState",
+    "ServerGoal",
+]

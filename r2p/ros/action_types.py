@@ -16,15 +16,19 @@
 
 import enum
 import functools
-from typing import Annotated, Any, ClassVar, Generic, Protocol, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Generic, Protocol, TypeVar
 
 import msgspec
 
-from r2p.errors import MessageError
+from r2p.errors import Error, MessageError
 from r2p.messages import Len, Max, Message, Timestamp, i8, show
 from r2p.messages.definition import TYPE_NAME, MessageMeta
 from r2p.messages.layouts import full_name
 from r2p.services.definition import Service, name_nested
+
+SEND_GOAL, CANCEL_GOAL, GET_RESULT = "_action/send_goal", "_action/cancel_goal", "_action/get_result"
+FEEDBACK, STATUS = "_action/feedback", "_action/status"
+"""What follows after the name of an action, and a slash, in the names of its services and topics."""
 
 G = TypeVar("G", bound=Message)
 R = TypeVar("R", bound=Message)
@@ -114,6 +118,29 @@ class CancelCode(enum.IntEnum):
     """The goal has ended."""
 
 
+class GoalRejected(Error):
+    """A goal that the server did not accept; its log says why."""
+
+
+class GoalAborted(Error):
+    """A goal that its server has given up: raised by the handler, and by `ClientGoal.wait`.
+
+    `result` is what was reached until then: of the type of results; None stands for one of zeros.
+    """
+
+    def __init__(self, text: str, result: Message | None = None) -> None:
+        super().__init__(text)
+        self.result: Any = result
+
+
+class GoalCanceled(Error):
+    """A goal that was cancelled; `result` is what was reached until then."""
+
+    def __init__(self, text: str, result: Message) -> None:
+        super().__init__(text)
+        self.result: Any = result
+
+
 class UUID(Message, name="unique_identifier_msgs/UUID"):
     """The identifier of a goal, which its client makes up; of zeros: all goals."""
 
@@ -168,10 +195,10 @@ class ActionTypes(msgspec.Struct, Generic[G, R, F], frozen=True, eq=False):
 
 
 @functools.lru_cache(maxsize=256)
-def action_types(action: ActionType[G, R, F]) -> ActionTypes[G, R, F]:
+def action_types(action: type[ActionType[G, R, F]]) -> ActionTypes[G, R, F]:
     """Return the types of an action. Raises MessageError if a nested class is missing."""
     goal, result, feedback = (_nested(action, part) for part in _PARTS)
-    name: str = getattr(action, "_full_name", None) or full_name(cast("type", action)).replace("/", "/action/")
+    name: str = getattr(action, "_full_name", None) or full_name(action).replace("/", "/action/")
     send_goal = _service(f"{name}_SendGoal", {"goal_id": UUID, "goal": goal}, {"accepted": bool, "stamp": Timestamp})
     get_result = _service(f"{name}_GetResult", {"goal_id": UUID}, {"status": i8, "result": result})
     message = _message(f"{name}_FeedbackMessage", {"goal_id": UUID, "feedback": feedback})

@@ -29,7 +29,7 @@ from r2p.runtime.ticks import Tick, ticks
 from r2p.runtime.topic import TopicSpace
 from r2p.services.client import ServiceClient
 from r2p.services.definition import Definition, Q, R, ServiceType, define
-from r2p.services.server import LIMIT, Handler, ServiceServer
+from r2p.services.server import LIMIT, Handler, HandlerOwner, ServiceServer
 
 M = TypeVar("M", bound=Message)
 V = TypeVar("V", bound=bool | int | float | str | enum.Enum | tuple[float, ...])
@@ -85,8 +85,8 @@ class Node:
         """Open publishers, in order (the values mean nothing)."""
         self.subscribers: dict[Subscriber[Any], None] = {}
         """Open subscribers, in order."""
-        self.services: dict[ServiceServer[Any, Any] | ServiceClient[Any, Any], None] = {}
-        """Open servers and clients of services, in order."""
+        self.services: dict[HandlerOwner | ServiceClient[Any, Any], None] = {}
+        """Open servers and clients of services, in order, and servers and clients of actions."""
         self.closed = False
         self.replaced = ReplacedNode()
         """The publishers and services of the node that this one replaces, in a swap."""
@@ -143,7 +143,7 @@ class Node:
         class value, TypeMismatch if the topic has another layout, and Closed once the node has ended.
         """
         shape = layout(type)
-        name = self._resolve(topic)
+        name = self.resolve(topic)
         check_class(name, klass)
         self._check_links(name, shape, klass, strict=strict)
         where = self._space.open(name, shape)
@@ -237,7 +237,7 @@ class Node:
         options = SubscriberOptions(callback, queue, lossy, keep, max_age, timeout, on_timeout, queue_bytes)
         options.check(topic)
         shape = None if type is None else layout(type)
-        name = self._resolve(topic)
+        name = self.resolve(topic)
         accepted = AcceptedTypes(name, shape, accept) if accept else None
         where = self._space.open(name, shape) if accepted is None else self._space.open_accepting(name, accepted)
         if shape is not None:
@@ -444,7 +444,7 @@ class Node:
 
     def end_handlers(self) -> list[asyncio.Task[None]]:
         """Cancel the handlers of the node's services; return the tasks of those that still clean up."""
-        servers = [each for each in self.services if isinstance(each, ServiceServer)]
+        servers = [each for each in self.services if isinstance(each, HandlerOwner)]
         return [task for server in servers for task in server.stop("its node ends")]
 
     def forget(self, endpoint: object) -> None:
@@ -499,7 +499,7 @@ class Node:
 
     def _define(self, name: str, request: Any, response: Any) -> Definition[Any, Any]:
         """Return the definition of a service under its name after remapping."""
-        return define(self._resolve(name), request, response)
+        return define(self.resolve(name), request, response)
 
     def _serve_with(
         self, definition: Definition[Any, Any], handler: Handler[Any, Any], limit: int
@@ -518,7 +518,8 @@ class Node:
         ):
             self._warn_of_links(topic, shape, "is not sent on")
 
-    def _resolve(self, topic: str) -> str:
+    def resolve(self, topic: str) -> str:
+        """Return the name of a topic or service after remapping. Raises InvalidName or NameTooLong, and Closed."""
         if self.closed:
             raise Closed(f"node {self.name} has ended: it can't use topic {topic} any more")
         name = topic_name(topic)

@@ -8,6 +8,7 @@ While a handler waits for a call of its own it does not count as running (`Handl
 each other, or themselves, never block each other for good.
 """
 
+import abc
 import asyncio
 import inspect
 import logging
@@ -95,7 +96,22 @@ class Handling(msgspec.Struct, eq=False):
             self.server.resume(self)
 
 
-class ServiceServer(Generic[Q, R]):
+class HandlerOwner(abc.ABC):
+    """What runs handlers of a node beside its function, in `Node.services`, and ends with it."""
+
+    name: str
+    """The name of the service or action, after remapping."""
+
+    @abc.abstractmethod
+    def stop(self, reason: str) -> list[asyncio.Task[None]]:
+        """Accept nothing more and cancel all handlers; return the tasks of those that still clean up."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """End everything; the node's handlers have ended."""
+
+
+class ServiceServer(HandlerOwner, Generic[Q, R]):
     """Serves a service. Made by `Node.serve` and `Node.service`; closed by `close()` or when its node ends."""
 
     def __init__(
@@ -223,7 +239,6 @@ class ServiceServer(Generic[Q, R]):
         return bool(self._own())
 
     def stop(self, reason: str) -> list[asyncio.Task[None]]:
-        """Accept nothing more and cancel all handlers; return the tasks of those that still clean up."""
         self._ending = self._ending or reason
         for handling in [*reversed(self._waiting), *self._own()]:  # those that wait first: none may start
             self.cancel(handling, reason)
