@@ -1,12 +1,14 @@
 """Publishers and subscribers of ROS 2 topics over zenoh.
 
 A transient local publisher keeps its last messages in zenoh's cache, which later subscribers ask for them. Messages go
-out in the loop, except large ones: a thread hands those to zenoh, which waits for room for their fragments.
+out in the loop: where the network is slower, zenoh drops them. A thread hands over large ones, as zenoh waits for room
+for their fragments, and those of publishers that keep all, for which it waits for up to 5 s.
 """
 
 import functools
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import zenoh
 import zenoh.ext
 from zenoh.handlers import RingChannel
@@ -38,6 +40,7 @@ _CACHE_MAX = 10_000
 _HEARTBEAT_S = 0.5  # seconds after which a subscriber of a transient local topic learns what it has missed
 _RING_MIN, _RING_MAX = 512, 4096  # messages of one topic that wait in zenoh; of more, the oldest are lost
 _ATTACHMENT_MAX = 512  # bytes; longer ones are not read
+_GAP_MAX = 1 << 24  # messages missed at once; more is a number that does not count
 _GIDS_MAX = 1024  # publishers of one topic whose nodes are remembered
 
 
@@ -48,6 +51,7 @@ class RmwPublisher:
         self.endpoint = endpoint
         self._session = session
         self._large = session.zenoh.large
+        self._waits_for_room = _waits_for_room(endpoint.qos)
         self._waiting = 0
         dds_name = dds_type(endpoint.type.name)
         key = data_key(session.domain, endpoint.topic, dds_name, endpoint.type.checksum)
@@ -63,7 +67,7 @@ class RmwPublisher:
         """Send a message; `stamp` is UTC in ns, 0: now."""
         self._sequence += 1
         attachment = encode_attachment(self._sequence, stamp or self._session.clock.now(), self._gid)
-        if len(data) > LARGE or self._waiting or self._session.zenoh.outbound.uses_thread:
+        if len(data) > LARGE or self._waits_for_room or self._waiting or self._session.zenoh.outbound.uses_thread:
             self._submit(bytes(data), attachment)
             return
         try:
@@ -105,19 +109,20 @@ class RmwPublisher:
 def _declare_publisher(
     session: zenoh.Session, key: str, endpoint: RosEndpoint
 ) -> "zenoh.Publisher | zenoh.ext.AdvancedPublisher":
-    """Declare the publisher. Never BLOCK: that would stop the loop."""
+    """Declare the publisher."""
     qos = endpoint.qos
+    block, drop = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
+    congestion, remote = block if _waits_for_room(qos) else drop, zenoh.Locality.REMOTE
     reliability = zenoh.Reliability.RELIABLE if qos.reliable else zenoh.Reliability.BEST_EFFORT
-    drop, remote = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE
     if not qos.transient_local:
         return session.declare_publisher(
-            key, congestion_control=drop, reliability=reliability, allowed_destination=remote
+            key, congestion_control=congestion, reliability=reliability, allowed_destination=remote
         )
     detection = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S) if qos.reliable else None
     return zenoh.ext.declare_advanced_publisher(
         session,
         key,
-        congestion_control=drop,
+        congestion_control=congestion,
         reliability=reliability,
         allowed_destination=remote,
         cache=zenoh.ext.CacheConfig(max_samples=_cached(qos.depth)),
@@ -126,8 +131,21 @@ def _declare_publisher(
     )
 
 
+def _waits_for_room(qos: Qos) -> bool:
+    """Return whether all messages are to arrive, as in rmw_zenoh: a thread sends them, as zenoh waits for room."""
+    return qos.reliable and not qos.depth
+
+
 def _cached(depth: int) -> int:
     return min(depth or _CACHE_DEFAULT, _CACHE_MAX)
+
+
+class RmwRemotePublisher(msgspec.Struct):
+    """Another node's publisher: its node in this version of the graph, and the number of its last message."""
+
+    node: str
+    graph_version: int
+    sequence: int
 
 
 class RmwSubscription:
@@ -140,8 +158,7 @@ class RmwSubscription:
         self._type = dds_type(first.type.name)
         self._key = data_key(session.domain, first.topic, self._type, first.type.checksum)
         self._encoded = first.topic.encode()
-        self._nodes: dict[bytes, str] = {}
-        self._graph_version = -1
+        self._publishers: dict[bytes, RmwRemotePublisher] = {}
         self._reader: SubscriptionReader | None = None
         self._transient_local = False
         self._held: zenoh.Sample | None = None
@@ -201,9 +218,12 @@ class RmwSubscription:
         arrivals: list[RosArrival] = []
         while sample is not None and len(arrivals) < MESSAGES_PER_TURN:
             try:
-                arrivals.append(self._arrival(sample))
+                arrival = self._arrival(sample)
             except DecodeError as error:
                 session.lost[str(error)] += 1
+            else:
+                if arrival is not None:
+                    arrivals.append(arrival)
             sample = reader.receive()
         if arrivals:
             session.lost.guard(session.user.received, arrivals)
@@ -222,8 +242,8 @@ class RmwSubscription:
         else:
             self._read(sample)
 
-    def _arrival(self, sample: zenoh.Sample) -> RosArrival:
-        """Return a message. Raises DecodeError, with the reason that is counted."""
+    def _arrival(self, sample: zenoh.Sample) -> RosArrival | None:
+        """Return a message; None for one that was received before. Raises DecodeError, with the reason to count."""
         header, payload = sample.attachment, sample.payload
         if sample.kind != zenoh.SampleKind.PUT or len(payload) > SIZE_MAX:
             raise DecodeError("too long" if len(payload) > SIZE_MAX else "not a message")
@@ -233,18 +253,29 @@ class RmwSubscription:
             sequence, stamp, gid = decode_attachment(header.to_bytes())
         except DecodeError:
             raise DecodeError("wrong attachment") from None
-        node = self._nodes.get(gid) if self._graph_version == self._session.graph.version else None
-        if node is None:
-            node = self._node_of(gid)
-        return RosArrival(self._encoded, payload.to_bytes(), node, max(sequence, 0), max(stamp, 0), gid)
+        publisher = self._publishers.get(gid)
+        if publisher is None or publisher.graph_version != self._session.graph.version:
+            publisher = self._look_up(gid, publisher)
+        if sequence != publisher.sequence + 1 and self._was_received(sequence, publisher.sequence):
+            return None
+        publisher.sequence = sequence
+        return RosArrival(self._encoded, payload.to_bytes(), publisher.node, max(sequence, 0), max(stamp, 0), gid)
 
-    def _node_of(self, gid: bytes) -> str:
+    def _was_received(self, sequence: int, last: int) -> bool:
+        """Return whether a transient local publisher's message came before; count those missed before this one."""
+        if 0 < last < sequence < last + _GAP_MAX:
+            self._session.lost["on the way"] += sequence - last - 1
+        return self._transient_local and 0 < sequence <= last
+
+    def _look_up(self, gid: bytes, known: "RmwRemotePublisher | None") -> "RmwRemotePublisher":
+        """Return a publisher whose node is that in the graph now."""
         graph = self._session.graph
-        if len(self._nodes) >= _GIDS_MAX or self._graph_version != graph.version:
-            self._nodes.clear()
-            self._graph_version = graph.version
-        node = self._nodes[gid] = graph.node_of(gid, EntityKind.PUBLISHER, self.topic)
-        return node
+        if len(self._publishers) >= _GIDS_MAX:
+            self._publishers.clear()
+        sequence = 0 if known is None else known.sequence
+        node = graph.node_of(gid, EntityKind.PUBLISHER, self.topic)
+        found = self._publishers[gid] = RmwRemotePublisher(node, graph.version, sequence)
+        return found
 
 
 def _declare_subscriber(session: zenoh.Session, key: str, qos: Qos) -> Any:

@@ -47,8 +47,9 @@ async def test_recorded_messages() -> None:
 
 
 @pytest.mark.anyio
-async def test_tokens() -> None:
+async def test_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
     """Odd tokens are counted, and the graph has what the others stand for; a node of the same name is reported."""
+    monkeypatch.setattr("r2p.ros.ros2.matches._REACH_TRIES", 3)
     async with router() as network, joined(network, "/here") as (a, user):
         a.advertise(endpoint("/here", "/accept"))
         with network.plain_session() as session:
@@ -61,7 +62,7 @@ async def test_tokens() -> None:
             assert user.graph.nodes == {"/peer", "/here"}
             (text,) = user.notices
             assert text == "there is another ROS node /here: tools can't tell the two apart, so rename one of them"
-            # Without a subscriber for the token: it is reported all the same, after a second.
+            # Without a subscriber for the token: it is reported all the same, a little later.
             await user.until(lambda: "joined /accept" in user.events)
             del tokens
         await user.until(lambda: not user.graph.nodes and "gone /accept" in user.events)
