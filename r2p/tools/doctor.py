@@ -13,20 +13,20 @@ import platform
 import socket
 import statistics
 import sys
-import textwrap
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import msgspec
 import typer
 
 import r2p
 from r2p.clock import Ticker
 from r2p.codecs.management import WIRE_VERSION
 from r2p.names import module_name_from
+from r2p.tools import ros_checks
+from r2p.tools.checks import Check
 from r2p.tools.options import Format
 from r2p.tools.output import Output
 from r2p.tools.session import Session, Settings, UsageError, check_urls, join, settings, standalone, wait_until
@@ -38,7 +38,6 @@ EXTRAS = {"can": "python-can", "elf": "pyelftools", "ros": "rosbags", "serial": 
 
 _ROOT = Path("/")
 _UP = 1  # IFF_UP
-_COMMANDS = ("sudo ", "echo ", "pip ", "ip ", "ls ", "r2p ")  # steps that begin like this are for the shell
 _PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttyS*", "rfcomm*", "cu.usb*")
 _TICK = MILLISECOND  # ns
 _SAMPLE = 0.2  # seconds
@@ -52,42 +51,6 @@ Try = Annotated[
     list[str] | None,
     typer.Option("--via", metavar="URL", help="Try this link: tcp:HOST:PORT, serial:DEVICE, ... (repeatable)."),
 ]
-
-
-class Check(msgspec.Struct, frozen=True):
-    """The result of one check: what was found, and what to `do` if it is not `ok` or could be better."""
-
-    what: str
-    ok: bool
-    found: str
-    do: str = ""
-
-    def record(self) -> dict[str, Any]:
-        return {"check": self.what, "ok": self.ok, "found": self.found, "do": self.do or None}
-
-    def text(self, yes: str = "has", no: str = "lacks", *, width: int | None = None) -> str:
-        """Return lines for people; those that are wider than `width` break between words, within their column."""
-        steps = [step for step in self.do.split("\n") if step]
-        head = f"{yes if self.ok else no:<6} {self.what:<13} "
-        lines = [_wrapped(head, self.found, width), *(_wrapped(f"{'':20} > ", step, width) for step in steps)]
-        return "\n".join(lines)
-
-
-def _wrapped(head: str, text: str, width: int | None) -> str:
-    """Wrap a text behind a head. A command continues in the way of shells, so that it can be copied."""
-    if width is None or len(head) + len(text) <= width:
-        return head + text
-    indent = " " * min(len(head), width // 2)
-    continued = " \\" if text.startswith(_COMMANDS) else ""
-    wrapped = textwrap.wrap(
-        text,
-        width - len(continued),
-        initial_indent=head,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return f"{continued}\n".join(wrapped)
 
 
 @standalone
@@ -336,6 +299,10 @@ async def _try_url(url: str) -> AsyncGenerator[Check, None]:
         yield name
         if not name.ok:
             return
+    async for check in ros_checks.before(url):
+        yield check
+        if check.what == "master" and not check.ok:
+            return
     try:
         async with join(Settings(via=[url])) as session:
             async for check in try_link(session):
@@ -383,7 +350,8 @@ async def try_link(session: Session) -> AsyncIterator[Check]:
             yield keys
             return
         await wait_until(lambda: bool(_named(session)) or not session.may_have_firmware(), _ROUND)
-        for check in (*_received(session, url), *_losses(session), *map(_notice, notices.values())):
+        others = ros_checks.nodes(session) if ros_checks.is_ros(url) else _received(session, url)
+        for check in (*others, *_losses(session), *map(_notice, notices.values())):
             yield check
     finally:
         listening.cancel()
@@ -478,6 +446,7 @@ _CONNECTING = {
     "serial": "ls -l DEVICE; groups\nls /dev/serial/by-id",
     "rtcan": "r2p doctor\nip -details -statistics link show DEVICE",
     "zenoh": "on the other computer: is a zenoh 1 router or an r2p program running? ss -ltnp lists the ports",
+    "ros2": "start a router: ros2 run rmw_zenoh_cpp rmw_zenohd\nor name its computer: --via ros2:tcp/HOST:7447",
 }
 """Remedies if a link does not come up, by scheme."""
 

@@ -18,7 +18,7 @@ from r2p.codecs import management
 from r2p.msg import Led
 from r2p.sim.modules import FirmwareModule, Powered, Publishes
 from r2p.tools import doctor
-from r2p.tools.doctor import Check
+from r2p.tools.checks import Check
 from r2p.tools.output import Output
 from r2p.tools.session import Session, Settings, join
 from r2p.transports.can.netlink import Interface
