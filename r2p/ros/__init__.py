@@ -7,6 +7,7 @@ cdr           the serialisation of ROS 2; that of ROS 1 is r2p's own
 conversions   which types of r2p are which of ROS; `standard` and `reports` have the functions
 stamps        when what a message says was measured
 clock         the time of a ROS network, /clock
+tf            transforms, /tf
 library       the definitions that come with ROS, and what the ends of a connection compare of a type
 source        Python source of message classes
 packages      packages for ROS with the types of r2p's classes

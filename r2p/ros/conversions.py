@@ -35,7 +35,7 @@ class Conversion(msgspec.Struct, frozen=True):
 
     `theirs` is the ROS type as a class, whose bytes are those of ROS 1; for ROS 2 use `r2p.ros.cdr`. `to_ros` takes a
     message, its stamp (UTC, ns) and its source, and returns one message or several. `lost_to_ros` and `lost_from_ros`
-    say in words what the other type lacks. Both functions raise MessageError for a message that it can't have.
+    say in words what the result is without. Both functions raise MessageError for a message that it can't have.
     """
 
     ours: type[Message]
@@ -104,10 +104,10 @@ def _into(cls: type[Message], from_ros: FromRos) -> FromRos:
 _PLANE = "z, roll and pitch, and their rates"
 _NO_STAMP = "the stamp, which is that of the sample"
 _COVARIANCES = "covariances"
-_IMU = "nothing; no acceleration and no covariance are given"
+_IMU = "accelerations and covariances"
 _FROM_IMU = "accelerations, covariances; without an orientation the angles are NaN"
-_ODOMETRY = "nothing; the covariances are 0, unknown"
-_GPS = "speed, course, number of satellites; the altitude stays that above mean sea level"
+_ODOMETRY = "covariances, which are 0: unknown"
+_GPS = "speed, course and number of satellites; the altitude stays that above mean sea level"
 _FROM_GPS = "covariances but for a dilution of precision, the service; speed and course are NaN"
 _ALL = "everything: there is no way back"
 
@@ -133,14 +133,14 @@ PAIRS = (
         ours.Battery,
         "sensor_msgs/BatteryState",
         standard.battery,
-        "the remaining time",
+        "the remaining time, temperature, capacities",
         "temperature, capacities, cells, health, technology; a current that is not measured is 0",
     ),
     _in_both(
         ours.Proximity,
         "sensor_msgs/Range",
         standard.proximity,
-        "nothing: four messages, in the frames `TOPIC_0` to `TOPIC_3`",
+        "the field of view; it is four messages, in the frames `TOPIC_0` to `TOPIC_3`",
         "field of view and limits; a frame's last digit says which of the four readings it is",
     ),
     _in_both(ours.GPS, "sensor_msgs/NavSatFix", standard.gps, _GPS, f"{_FROM_GPS}, {_NO_STAMP}"),
@@ -149,7 +149,7 @@ PAIRS = (
         ours.Pressure,
         "sensor_msgs/FluidPressure",
         standard.pressure,
-        "the altitude",
+        "the altitude and a variance",
         f"variance, {_NO_STAMP}; the altitude is computed by the standard atmosphere",
     ),
     TypePair(
@@ -157,11 +157,17 @@ PAIRS = (
         "rosgraph_msgs/Log",
         "rcl_interfaces/Log",
         reports.log,
-        "nothing; there is no file, function or line",
+        "file, function and line",
         "file, function, line; texts over 128 characters, names over 7 and 8, and characters beyond ASCII",
     ),
     _in_both(ours.GatewayStatus, "diagnostic_msgs/DiagnosticArray", reports.gateway_status, "", _ALL),
-    _in_both(ours.PowerEvent, "diagnostic_msgs/DiagnosticArray", reports.power_event, "which were crossed", _ALL),
+    _in_both(
+        ours.PowerEvent,
+        "diagnostic_msgs/DiagnosticArray",
+        reports.power_event,
+        "those that were just crossed",
+        _ALL,
+    ),
     _in_both(ours.BusTraffic, "diagnostic_msgs/DiagnosticArray", reports.bus_traffic, "", _ALL),
     _in_both(ours.Float32, "std_msgs/Float32", standard.number, "", ""),
     _in_both(ours.Text, "std_msgs/String", standard.text, "", "texts over 64 characters, characters beyond ASCII"),

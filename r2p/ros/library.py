@@ -20,6 +20,8 @@ from r2p.ros.hashes import TypeDescriptions
 from r2p.ros.packages import OF_ROS
 
 _PARTS = {".srv": parse_service, ".action": parse_action}
+_MISSING = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
+"""Types that come with ROS 1, and that rosbags has only for ROS 2."""
 _FIRST_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
 
 
@@ -53,10 +55,14 @@ def load_definitions(version: int) -> None:
 @functools.cache
 def _store(version: int) -> Any:
     try:
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise MessageError("the definitions of ROS are in rosbags: pip install 'r2p[ros]'") from error
-    return get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.LATEST)
+    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.LATEST)
+    for name, text in _MISSING.items():
+        if name not in store.types:
+            store.register(get_types_from_msg(text, name))
+    return store
 
 
 class DefinitionFile:

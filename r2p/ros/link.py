@@ -213,7 +213,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         qos = publisher_qos(self._space.topics.get(topic), latched=latched, change=lookup(self.options.qos, topic))
         endpoints = {RosEndpoint(node, name, travel.type, qos) for node in shown or [default]}
         self._registrations.declare(topic, ROLE_PUBLISHES, endpoints)
-        if qos.transient_local:  # the middleware keeps the values for later subscribers, so it has to get each
+        # The middleware keeps the values for later subscribers, so it has to get each; but logs would load each bus.
+        if qos.transient_local and topic != LOG:
             self._apply(self._ros.set_subscribed(topic, subscribed=True))
 
     def _subscribe(self, topic: str, name: str, travel: RosTopic | None) -> None:

@@ -7,6 +7,7 @@
 | `queue=N` | depth N |
 | `lossy=True` | best effort; so are subscribers of a topic that any ROS node publishes as best effort |
 | a subscriber of a topic that all ROS nodes latch | transient local |
+| the topic `log`, `/rosout` there | as all ROS nodes: transient local, depth 1000, lifespan 10 s |
 
 `--qos` changes each of these.
 """
@@ -14,11 +15,14 @@
 from collections.abc import Sequence
 
 from r2p.codecs.management import QUEUE
+from r2p.names import LOG
 from r2p.ros.middleware import Qos, RosPeerEndpoint
 from r2p.ros.options import QosChange
 from r2p.runtime.publishers import PeriodicPublisher, SporadicPublisher
 from r2p.runtime.topic import PublisherHandle, Topic
 from r2p.units import SECOND
+
+ROSOUT = Qos(transient_local=True, depth=1000, lifespan=10 * SECOND)
 
 _DEPTH = 10
 
@@ -34,6 +38,8 @@ def publisher_qos(topic: Topic | None, *, latched: bool, change: QosChange | Non
         deadline=max(periods, default=0) if all(periods) else 0,
         lifespan=max(lifespans, default=0) if all(lifespans) else 0,
     )
+    if topic is not None and topic.name == LOG:
+        qos = ROSOUT
     return qos if change is None else change.apply(qos)
 
 

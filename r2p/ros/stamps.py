@@ -15,8 +15,6 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-import msgspec
-
 from r2p.errors import DecodeError
 from r2p.messages import Layout, Message, Nested, Shape, Timestamp, layout
 from r2p.runtime.sample import Sample
@@ -41,19 +39,6 @@ def stamp_of(message: Any) -> Timestamp | None:
         if isinstance(found, Timestamp) and (found.sec or found.nsec):
             return found
     return None
-
-
-def with_header_stamp(message: Any, ns: int) -> Any:
-    """Return a message of ROS whose `header.stamp` is this one (UTC), if it has a header with no stamp; else the same.
-
-    Raises MessageError for an instant outside of 1970 to 2106.
-    """
-    header = getattr(message, "header", None)
-    own = getattr(header, "stamp", None)
-    if not isinstance(own, Timestamp) or own.sec or own.nsec:
-        return message
-    filled = msgspec.structs.replace(header, stamp=Timestamp.from_ns(ns))  # type: ignore[type-var]
-    return msgspec.structs.replace(message, header=filled)
 
 
 class StampSource:

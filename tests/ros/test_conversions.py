@@ -215,7 +215,7 @@ def test_names_of_ros_in_log_records(name: str, owner: tuple[str, str]) -> None:
 
 def test_the_page_has_all_conversions() -> None:
     page = (ROOT / "docs" / "how-to" / "ros-types.md").read_text()
-    table = page.split("| r2p | ROS | what ROS's lacks | what r2p's lacks |\n")[1].split("\n\n")[0]
+    table = page.split("| r2p | ROS | to ROS without | from ROS without |\n")[1].split("\n\n")[0]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[1:]]
     assert rows == [
         [

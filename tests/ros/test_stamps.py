@@ -8,7 +8,7 @@ import pytest
 import r2p
 from r2p.messages import ClockOffset
 from r2p.msg import Header, LaserScan, Led, Log, StampedEncoder, StampedIMU, Timestamp
-from r2p.ros.stamps import STAMP_OF_RECEPTION, StampSource, stamp_of, with_header_stamp
+from r2p.ros.stamps import STAMP_OF_RECEPTION, StampSource, stamp_of
 from r2p.runtime.sample import Sample, Source
 from r2p.units import SECOND
 
@@ -69,10 +69,6 @@ def test_cut_messages_have_the_stamp_of_the_sample(cls: type[r2p.Message]) -> No
     assert StampSource(cls, Counter()).find(cut) == PUBLISHED
 
 
-def test_a_header_without_a_stamp_gets_one() -> None:
-    filled = with_header_stamp(LaserScan(header=Header(4, frame_id="laser"), range_max=2.0), UTC + 3)
-    assert filled == LaserScan(header=Header(4, Timestamp.from_ns(UTC + 3), "laser"), range_max=2.0)
-    for message in (filled, Led(), StampedIMU()):
-        assert with_header_stamp(message, UTC) is message
-    assert stamp_of(filled) == Timestamp.from_ns(UTC + 3)
+def test_the_stamp_of_a_message() -> None:
+    assert stamp_of(LaserScan(header=Header(stamp=MEASURED))) == stamp_of(StampedIMU(MEASURED)) == MEASURED
     assert stamp_of(LaserScan()) is stamp_of(Led()) is None
