@@ -40,6 +40,7 @@ from r2p.ros.middleware import (
     RosArrival,
     RosEndpoint,
     RosGraph,
+    RosPeerEndpoint,
     RosType,
 )
 from r2p.ros.options import RosOptions, lookup
@@ -170,16 +171,20 @@ class RosLink(BufferedLink, MiddlewareUser):
             return None, ""
         if name is None:
             return None, "ROS has no such names: parts begin with a letter, and all have at most 240 characters"
-        hooks, nothing = self.gateway_hooks, (TopicType(), TopicType())
-        elsewhere = nothing if hooks is None else hooks.types_elsewhere(topic)
         peers = self._ros.peers_of(topic)
-        cls = self._classes.find(topic, elsewhere, peers)
+        cls = self.class_of(topic, peers)
         if cls is None:
             return None, _UNKNOWN
         try:
             return self._types.find(topic, cls, {each.type for each in peers if each.type}), ""
         except MessageError as error:
             return None, str(error)
+
+    def class_of(self, topic: str, peers: Sequence[RosPeerEndpoint] = ()) -> type[Message] | None:
+        """Return the class of a topic that has these publishers and subscribers in other ROS nodes; None if unknown."""
+        hooks, nothing = self.gateway_hooks, (TopicType(), TopicType())
+        elsewhere = nothing if hooks is None else hooks.types_elsewhere(topic)
+        return self._classes.find(topic, elsewhere, peers)
 
     def _learn_type(self, topic: str) -> None:
         """Find out the type of a topic that ROS nodes have, and this side does not, or does not know."""
@@ -271,7 +276,7 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
         known = (cls for cls in self._classes.known if layout(cls).fingerprint == fingerprint)
-        return next(known, None)
+        return next(known, None) or self.services.message_type(fingerprint)
 
     # Out
 

@@ -9,7 +9,7 @@ are left out, except for those that have a client here.
 """
 
 import functools
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import msgspec
 
@@ -17,9 +17,11 @@ from r2p.codecs import services
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.codecs.services import HEADER_SIZE, REQUESTS, RESPONSES, ServiceHeader
 from r2p.errors import DecodeError, MessageError
-from r2p.messages import Layout
+from r2p.messages import Layout, Message, layout
 from r2p.names import SERVICE_SUFFIXES
-from r2p.protocols.discovery.events import Event
+from r2p.protocols.discovery.events import Event, TopicType
+from r2p.ros import std_srvs
+from r2p.ros.action_types import CancelGoal
 from r2p.ros.discovery import RosDiscovery
 from r2p.ros.graph_names import GraphNames
 from r2p.ros.middleware import (
@@ -35,9 +37,9 @@ from r2p.ros.middleware import (
 from r2p.ros.options import RosOptions, lookup
 from r2p.ros.registrations import CALLS, SERVES, Registrations, RosClient
 from r2p.ros.service_calls import UNKNOWN_LIFETIME, CarriedService, RosCalls, RosRequests
-from r2p.ros.service_types import RosServiceCodec, service_codec, service_shape
+from r2p.ros.service_types import RosServiceCodec, ServiceShape, service_codec, service_shape, service_type
 from r2p.runtime.sample import PublisherClass, Sample, Source
-from r2p.services.definition import define
+from r2p.services.definition import Definition, define
 from r2p.services.servers import KnownServers
 from r2p.transports.link import Hub
 from r2p.units import MILLISECOND
@@ -66,6 +68,9 @@ class ServiceLink(Protocol):
     middleware: Middleware
     names: GraphNames
     options: RosOptions
+
+    def class_of(self, topic: str) -> type[Message] | None:
+        """Return the class of a topic, which other modules may be asked for; None until it is known."""
 
     def key(self, topic: str) -> bytes:
         """Return what names a topic in an arrival."""
@@ -137,6 +142,7 @@ class RosServices:
         codec = self._codec(name) if ros_name is not None and (called or served) else None
         if codec is None or ros_name is None:
             self._forget(name)
+            self._show_type(name)
             return self._connect(name, called=False, served=False)
         service = self._carried.get(name)
         if service is None or service.codec is not codec:
@@ -252,10 +258,28 @@ class RosServices:
         if requests is not None and responses is not None and requests.layout and responses.layout:
             return requests.layout, responses.layout
         given = lookup(self._link.options.types, name)
-        if given is None:
-            return None
-        definition = define(name, given)
-        return definition.requests, definition.responses
+        if given is not None:
+            definition = define(name, given)
+            return definition.requests, definition.responses
+        learnt = [self._link.class_of(name + end) for end in SERVICE_SUFFIXES]
+        return None if learnt[0] is None or learnt[1] is None else (layout(learnt[0]), layout(learnt[1]))
+
+    def _show_type(self, name: str) -> None:
+        """Enter the type of a service of a ROS node that no node here uses, for tools, if it is one of every ROS."""
+        peers = self._discovery.peers.get((name + REQUESTS, ROLE_SUBSCRIBES), ())
+        for peer in peers:
+            known = _services_of_ros(self._link.middleware.version).get((peer.type, peer.checksum))
+            if known is not None:
+                for topic, shape in known.definition(name).topics:
+                    self._discovery.set_type(topic, TopicType(shape.size, shape.fingerprint, shape.varies))
+
+    def message_type(self, fingerprint: bytes) -> type[Message] | None:
+        """Return the class of the topics of a service of every ROS that has this fingerprint."""
+        for shape in _services_of_ros(self._link.middleware.version).values():
+            for each in (shape.requests, shape.responses):
+                if each.fingerprint == fingerprint:
+                    return cast("type[Message]", each.cls)
+        return None
 
     # Messages
 
@@ -314,6 +338,17 @@ class RosServices:
         if (service.name, text) not in self._noticed and len(self._noticed) < _NOTICES_MAX:
             self._noticed.add((service.name, text))
             self._link.notice("call failed", f"service {service.name} of a ROS node: {text}", trouble=True)
+
+
+@functools.cache
+def _services_of_ros(version: int) -> dict[tuple[str, str], ServiceShape]:
+    """Return the services that every ROS has, by the name and the checksum of their types."""
+    found: dict[tuple[str, str], ServiceShape] = {}
+    for each in (std_srvs.Empty, std_srvs.SetBool, std_srvs.Trigger, CancelGoal):
+        definition: Definition[Any, Any] = define("name", each)
+        shape = service_shape(definition.requests, definition.responses)
+        found[shape.name, service_type(shape, version).checksum] = shape
+    return found
 
 
 @functools.lru_cache(maxsize=1024)

@@ -190,7 +190,7 @@ async def test_through_a_gateway(version: int, loss: float) -> None:
         return await divide(request)
 
     ros.serve("/ros_divide", handler)
-    types: dict[str, Any] = {"ros_divide": Divide, "motor_divide": Divide}
+    types: dict[str, Any] = {"motor_divide": Divide}  # that of the other is learnt from its client
     gateway = r2p.Module("GW", via=[bus.transport(), network.transport(types=types)], bridge=True)
     async with gateway, bus.node("MOTOR") as node:
         server, client = node.serve("motor_divide", Divide, handler), node.client("ros_divide", Divide)
@@ -267,3 +267,32 @@ async def test_a_network_that_comes_back(version: int) -> None:
         await client.ready(1)
         assert (await client.call(Divide.Request(4.0, 2.0))).quotient == 2
         assert (await peer.call("/ours", Divide.Request(4.0, 2.0))).quotient == 2
+
+
+@both
+@pytest.mark.virtual_time
+async def test_a_gateway_learns_the_types_of_a_service(version: int) -> None:
+    network, bus = FakeRosNetwork(version), Network()
+    peer = Peer(network.node("/peer"), Divide)
+    gateway = r2p.Module("GW", via=[bus.transport(), network.transport()], bridge=True)
+    async with gateway, bus.node("MOTOR") as node:
+        node.serve("divide", Divide, divide)
+        await asyncio.sleep(5)
+        assert network.servers["/divide"][1].type == codec(Divide, version).type
+        assert (await peer.call("/divide", Divide.Request(4.0, 2.0))).quotient == 2
+
+
+@pytest.mark.virtual_time
+async def test_tools_know_the_services_that_every_ros_has() -> None:
+    network = FakeRosNetwork(2)
+
+    async def handler(request: SetBool.Request) -> SetBool.Response:
+        return SetBool.Response(success=request.data)
+
+    Peer(network.node("/server"), SetBool).serve("/enable", handler)
+    async with r2p.Module("PC1", via=network.transport(), observer=True) as module:
+        await asyncio.sleep(1)
+        view = module.network.topics()["enable_q"]
+        fingerprint = r2p.layout(define("enable", SetBool).requests.cls).fingerprint
+        assert view.fingerprint == fingerprint
+        assert await module.links[0].message_type(fingerprint) is not None
