@@ -69,7 +69,7 @@ class ModuleView(msgspec.Struct):
 
     `link` is empty for this module, `instance` is None for firmware. `wire` is the version of the wire formats that the
     module uses, `release` its version of r2p: None where it does not announce them, as firmware. `has_loader`: whether
-    it has a boot loader, as firmware and emulated boards do.
+    it has a boot loader, as firmware and emulated boards do. `kind` is "r2p", "firmware", or "ROS" for a ROS node.
     """
 
     name: str
@@ -81,6 +81,7 @@ class ModuleView(msgspec.Struct):
     wire: int | None = None
     release: str | None = None
     has_loader: bool = False
+    kind: str = "r2p"
 
 
 class NetworkView:
@@ -146,6 +147,8 @@ class NetworkView:
             raise Error(f"there is no module {module} on the network")
         if view.instance is None:
             raise Error(f"{module} is firmware: {firmware}")
+        if view.kind == "ROS":
+            raise Error(f"{module} is a ROS node, which knows nothing of r2p's modules: use the commands of ROS")
         if view.link and (view.wire or 0) < WIRE_MIN:
             known = f"has wire version {view.wire}" if view.wire else "does not say which version of r2p it has"
             raise Error(f"{module} {known}, {what} need {WIRE_MIN}: update r2p there")
@@ -252,7 +255,8 @@ def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:
     age = (now - info.last_heard) / SECOND
     rebooted, wire, release = bool(info.flags & FLAG_REBOOTED), info.wire or None, info.release or None
     has_loader = info.instance is None or bool(info.flags & FLAG_LOADER)
-    return ModuleView(info.name, state, rebooted, age, link.name, info.instance, wire, release, has_loader)
+    kind = link.foreign or ("firmware" if info.instance is None else "r2p")
+    return ModuleView(info.name, state, rebooted, age, link.name, info.instance, wire, release, has_loader, kind)
 
 
 def _state(flags: int, *, observer: bool) -> str:

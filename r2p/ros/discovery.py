@@ -282,7 +282,8 @@ class RosDiscovery(DiscoveryProtocol):
         modules: dict[str, ModuleInfo] = {}
         for node, (module, _) in named.items():
             instance = name_hash(node) & 0xFFFFFFFF
-            modules.setdefault(module, ModuleInfo(module, 0, now, instance, lease=FOR_EVER, source=node))
+            is_tool = self._names.is_tool(node)
+            modules.setdefault(module, ModuleInfo(module, 0, now, instance, is_tool, FOR_EVER, source=node))
         gone = [info for name, info in self.modules.items() if name not in modules]
         new = [info for name, info in modules.items() if name not in self.modules]
         self.modules.clear()

@@ -8,6 +8,7 @@ from r2p.ros.options import RosOptions
 NAME_MAX = 240
 """Characters of a name in ROS 2."""
 
+_TOOL = "r2p_tool_"
 _ROS_NAMES = {LOG: "rosout"}
 _OUR_NAMES = {theirs: ours for ours, theirs in _ROS_NAMES.items()}
 _ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -22,11 +23,14 @@ class GraphNames:
 
     What other ROS nodes have outside of the namespace is not seen here, except for topics that ROS has once for all
     robots (`RosOptions.absolute`). Names from the network may be anything: what no topic can have is None.
+
+    Two nodes of ROS can't have one name, so those of a `tool`, the name of whose module is random, end with that.
     """
 
-    def __init__(self, options: RosOptions) -> None:
+    def __init__(self, options: RosOptions, tool: str = "") -> None:
         self.ns = options.ns
         self._absolute = frozenset(options.absolute)
+        self._tool = tool
 
     def to_ros(self, topic: str) -> str | None:
         """Return the name of a topic or a service on the ROS network; None if ROS has no such names."""
@@ -50,7 +54,14 @@ class GraphNames:
 
     def node(self, *parts: str) -> str:
         """Return the full name of the ROS node of a module or node: `/robot1/blink`."""
+        if self._tool:
+            node = "" if parts[-1] == self._tool else f"{parts[-1]}_"
+            return f"{self.ns}/{_TOOL}{node}{self._tool.lstrip('_')}"
         return self.ns + _DIGIT.sub("n", f"/{'/'.join(parts)}")
+
+    def is_tool(self, node: str) -> bool:
+        """Return whether another ROS node is a command of r2p."""
+        return node.rpartition("/")[2].startswith(_TOOL)
 
     def module(self, node: str) -> tuple[str, str]:
         """Return the names of module and node under which another ROS node is shown here.

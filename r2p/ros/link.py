@@ -90,11 +90,12 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     max_payload: ClassVar[int] = SIZE_MAX
     passes_probes: ClassVar[bool] = False
+    foreign: ClassVar[str] = "ROS"
 
     def __init__(self, name: str, hub: Hub, middleware: Middleware, options: RosOptions) -> None:
         self.options = options
         self.middleware = middleware
-        self.names = GraphNames(options)
+        self.names = GraphNames(options, hub.space.module if hub.observer else "")
         name = unique_name(name, hub)
         counts = LoggedCounter(name, hub.space.clock)
         self._ros = RosDiscovery(hub.space.module, hub.instance, self.names, self._review_safely, counts)

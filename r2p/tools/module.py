@@ -38,8 +38,8 @@ Name = Annotated[str, typer.Argument(metavar="MODULE", autocompletion=complete_m
 async def list_(session: Session, *, all: All = False, wait: Wait = None, format: Format = None) -> None:
     """List the modules and their state.
 
-    The kind is r2p or firmware, and the age is the time since the last message from the module. With -v also the alias
-    of each long name, which travels on RTCAN and debug lines.
+    The kind is r2p, firmware or ROS, and the age is the time since the last message from the module. With -v also the
+    alias of each long name, which travels on RTCAN and debug lines.
     """
     output = Output(format)
     await session.settle(wait, of="modules")
@@ -81,6 +81,10 @@ async def info(session: Session, module: Name, *, wait: Wait = None, format: For
     record = _row(view, for_people=output.format == "text")
     if view.instance is None:
         notify(f"{module} is firmware: it counts nothing that others can ask for")
+        await output.put(record)
+        return
+    if view.kind == "ROS":
+        notify(f"{module} is a ROS node: it counts nothing that others can ask for")
         await output.put(record)
         return
     try:
@@ -150,6 +154,8 @@ class _CommandSender:
 
     def __init__(self, session: Session, command: r2p.Command, name: str) -> None:
         view = _find(session, name)
+        if view is not None and view.kind == "ROS":
+            raise r2p.Error(f"{view.name} is a ROS node, which knows no {command.name}: use the commands of ROS")
         self.name = name if view is None else view.name
         """The name of the module; what the user has given, which may be its alias, until the module is known."""
         self._session = session
@@ -304,7 +310,7 @@ def _row(view: r2p.ModuleView, *, for_people: bool) -> dict[str, Any]:
         "alias": alias_or_none(view.name, module_alias),
         "state": view.state,
         "rebooted": view.rebooted,
-        "kind": "firmware" if view.instance is None else "r2p",
+        "kind": view.kind,
         "version": view.release,
         "wire": f"{view.wire}, not {WIRE_VERSION}" if other else view.wire,
         "link": view.link,

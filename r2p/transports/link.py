@@ -144,6 +144,7 @@ class Link(abc.ABC):
     """Characters of the longest topic's name."""
     passes_probes: ClassVar[bool] = True
     """True if firmware gateways may be on the link."""
+    foreign: ClassVar[str] = ""  # "ROS": the modules on the link are nodes of that
     point_to_point: ClassVar[bool] = False
     """True if the link has only one other end."""
     lossless: bool = False
@@ -593,8 +594,7 @@ def unique_name(name: str, hub: Hub) -> str:
 def _discovery(link: str, hub: Hub, rate: float) -> Discovery:
     """Make the discovery of a line or a bus; `rate` is in messages per second."""
     counts = LoggedCounter(link, hub.space.clock)
-    burst = max(4, int(rate / 4))  # what a quarter of a second carries
-    aliases = hub.space.aliases
+    space, burst = hub.space, max(4, int(rate / 4))  # what a quarter of a second carries
     return Discovery(
-        hub.space.module, hub.instance, rate=rate, burst=burst, observer=hub.observer, counts=counts, aliases=aliases
+        space.module, hub.instance, rate=rate, burst=burst, observer=hub.observer, counts=counts, aliases=space.aliases
     )

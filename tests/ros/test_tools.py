@@ -1,0 +1,39 @@
+"""Commands of r2p on a ROS network: each is a ROS node of its own, and sees ROS nodes as such."""
+
+import asyncio
+
+import pytest
+
+import r2p
+from r2p.msg import String
+from r2p.testing.network import node_in
+from tests.ros.fake import FakeRosNetwork
+
+both = pytest.mark.parametrize("version", [1, 2])
+
+
+@both
+@pytest.mark.virtual_time
+async def test_two_tools_do_not_take_each_others_names(version: int) -> None:
+    network = FakeRosNetwork(version)
+    talker = network.node("/talker")
+    talker.advertise("/chatter", String)
+    async with (
+        r2p.Module("_aaaaaa", via=network.transport(), observer=True) as one,
+        r2p.Module("_bbbbbb", via=network.transport(), observer=True) as other,
+        r2p.Module("PC1", via=network.transport()) as program,
+        node_in(one, name="echo") as first,
+        node_in(other, name="echo") as second,
+    ):
+        texts = [node.subscribe("chatter", String) for node in (first, second)]
+        await asyncio.sleep(1)
+        talker.publish("/chatter", String("hello"))
+        assert [await each.fetch() for each in texts] == [String("hello")] * 2
+        graph = network.graph(talker)
+        seen = {view.name: (view.kind, view.state) for view in program.network.modules()}
+        with pytest.raises(r2p.Error, match="talker is a ROS node, which knows nothing of r2p's modules"):
+            await program.network.statistics("talker")
+    assert {each.node for each in graph.subscribers} == {"/r2p_tool_echo_aaaaaa", "/r2p_tool_echo_bbbbbb"}
+    assert seen["talker"] == ("ROS", "running")
+    assert seen["r2p_tool_echo_aaaaaa"] == ("ROS", "observer")
+    assert seen["PC1"] == ("r2p", "running")
