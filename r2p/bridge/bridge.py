@@ -84,6 +84,7 @@ class PortStatistics(msgspec.Struct, frozen=True):
     dropped: dict[str, int]
     offset: int | None = None
     error: int | None = None
+    not_carried: dict[str, str] = {}
 
 
 class GatewayStatistics(msgspec.Struct, frozen=True):
@@ -389,4 +390,5 @@ def _port_statistics(port: BridgePort) -> PortStatistics:
     state = port.tree_port.state.value if port.link.up else "down"
     clock = port.link.translation()
     offset, error = (None, None) if clock is None else (clock.offset, clock.error)
-    return PortStatistics(port.name, state, len(port.tree_port.gateways), dict(port.dropped), offset, error)
+    gateways, not_carried = len(port.tree_port.gateways), port.link.not_carried()
+    return PortStatistics(port.name, state, gateways, dict(port.dropped), offset, error, not_carried)

@@ -26,6 +26,9 @@ from r2p.units import SECOND
 
 T = TypeVar("T")
 
+PREFIX_ON = ("zenoh", "ros1", "ros2", "dds")
+"""The links where a prefix applies by default: networks that several robots share."""
+
 _CACHED_MAX = 1024  # names of links: each new client brings another one
 _UNKNOWN_PERIOD = SECOND // 20  # ns until a deadline while the period is not known
 _PERIOD_MAX = 10 * SECOND  # ns; after a longer pause the publisher has started again
@@ -70,7 +73,7 @@ class BridgeOptions(msgspec.Struct, frozen=True, kw_only=True):
     rate_limit: dict[str, float] = {}
     read_only: tuple[str, ...] = ()
     prefix: str = ""
-    prefix_on: tuple[str, ...] = ("zenoh",)
+    prefix_on: tuple[str, ...] = PREFIX_ON
     allow_control: bool = False
     classes: dict[str, ClassOf] = {}
     reserve: tuple[str, ...] = ()

@@ -11,6 +11,9 @@ tf            transforms, /tf
 library       the definitions that come with ROS, and what the ends of a connection compare of a type
 source        Python source of message classes
 packages      packages for ROS with the types of r2p's classes
+link          a link to a ROS network; discovery, registrations: what is there, and what this side has there
+topics        how topics travel; topic_classes, graph_names, qos, options: their types, names and quality of service
+middleware    the seam to ROS 1, rmw_zenoh or DDS
 service_types   types of services in ROS; std_srvs: those that every ROS has
 services        services between r2p and ROS nodes; service_calls: from a request to its answer
 action_types    types of actions; action_server and action_client: the two ends
@@ -19,6 +22,7 @@ action_types    types of actions; action_server and action_client: the two ends
 from r2p.ros.action_client import ActionClient, ClientGoal
 from r2p.ros.action_server import ActionServer, ServerGoal
 from r2p.ros.action_types import Action, GoalAborted, GoalCanceled, GoalRejected, GoalState
+from r2p.ros.options import QosChange, RosOptions
 
 __all__ = [
     "Action",
@@ -29,5 +33,7 @@ __all__ = [
     "GoalCanceled",
     "GoalRejected",
     "GoalState",
+    "QosChange",
+    "RosOptions",
     "ServerGoal",
 ]

@@ -12,6 +12,7 @@ otherwise pass each message on for ever.
 """
 
 import asyncio
+import itertools
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Annotated, Any, ClassVar
 
@@ -20,7 +21,7 @@ import msgspec
 from r2p.clock import in_background
 from r2p.codecs import management
 from r2p.codecs.management import GATEWAY_TYPES, ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.errors import DecodeError, MessageError
+from r2p.errors import DecodeError, MessageError, TransportError
 from r2p.messages import SIZE_MAX, Len, Message, layout
 from r2p.names import LOG, SERVICE_SUFFIXES
 from r2p.protocols.discovery.directory import TABLE_MAX
@@ -43,7 +44,7 @@ from r2p.ros.middleware import (
     RosPeerEndpoint,
     RosType,
 )
-from r2p.ros.options import RosOptions, lookup
+from r2p.ros.options import RosOptions, lookup, merged
 from r2p.ros.qos import publisher_qos, subscriber_qos
 from r2p.ros.registrations import Registrations
 from r2p.ros.services import RosServices, ServiceArrival
@@ -54,6 +55,7 @@ from r2p.runtime.topic import Topic
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.link import Hub, Transport, unique_name
 from r2p.transports.stats import LoggedCounter
+from r2p.transports.url import open_transport
 
 GATEWAYS = "/_r2p/gateways"
 """The topic on which gateways find each other; ROS's lists hide it, as its name begins with an underscore."""
@@ -240,13 +242,17 @@ class RosLink(BufferedLink, MiddlewareUser):
         """Return the ROS nodes that have a topic, by module and node."""
         own = self._ros.own_nodes.get((topic, role), {})
         if topic == LOG:  # of all nodes of the module: one of them publishes it
-            own = dict.fromkeys(sorted(self._ros.nodes - {LOG})[:1], 0)
+            free = (each for each in sorted(self._ros.nodes - {LOG}) if not self._is_refused(each))
+            own = dict.fromkeys(itertools.islice(free, 1), 0)
         found = {("", node): self.names.node(node) for node in own if node}
         if self.options.ros_nodes:
             for module, node in self._ros.relayed_nodes.get((topic, role), {}):
                 if module and node:
                     found[module, node] = self.names.node(module, node)
         return found
+
+    def _is_refused(self, node: str) -> bool:
+        return self.names.node(node) in self._registrations.refused
 
     # What is reported
 
@@ -445,6 +451,7 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def shut_down(self, node: str, reason: str) -> None:
         self._registrations.forget_node(node)
+        self._touch(LOG)
         self.notice("ROS node ended", f"{node} is no longer a ROS node here: {reason}", trouble=True)
 
 
@@ -480,3 +487,15 @@ class RosTransport(Transport):
         finally:
             link.close()
             hub.detach(link)
+
+
+def ros_transport(transport: Transport | str, options: RosOptions) -> RosTransport:
+    """Return a transport of ROS, or that of a URL, with these options added to its own.
+
+    Raises TransportError for any other transport, and for an invalid URL.
+    """
+    opened = open_transport(transport) if isinstance(transport, str) else transport
+    if not isinstance(opened, RosTransport):
+        raise TransportError(f"{transport} is not a link to ROS: write ros1:, ros2: or dds:")
+    opened.options = merged(opened.options, options)
+    return opened

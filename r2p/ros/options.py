@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 import msgspec
 
 from r2p.clock import duration
-from r2p.messages import Message
 from r2p.ros.middleware import Qos
 from r2p.transports.url import yes_or_no
 from r2p.units import SECOND
@@ -51,17 +50,26 @@ class RosOptions(msgspec.Struct, frozen=True, kw_only=True):
     """What to do differently on one link to a ROS network. The keys of all tables are topics, or patterns for them.
 
     `ns` is the namespace of this side's topics and nodes (`/robot1`), except for topics in `absolute`, by their names
-    without the first slash. `types` has the classes of topics that no node here has a class for, and `ros_types` the
-    full names of the ROS types that topics are to have there. `qos` changes the quality of service. With `ros_nodes`
-    each node behind a gateway is shown as a ROS node of its own.
+    without the first slash. `types` has the classes of topics and services that no node here has a class for, and
+    `ros_types` the full names of the ROS types that topics are to have there. `qos` changes the quality of service.
+    With `ros_nodes` each node behind a gateway is shown as a ROS node of its own.
     """
 
     ns: str = ""
     absolute: tuple[str, ...] = ABSOLUTE
-    types: Mapping[str, type[Message]] = {}
+    types: Mapping[str, type[Any]] = {}
     ros_types: Mapping[str, str] = {}
     qos: Mapping[str, QosChange] = {}
     ros_nodes: bool = False
+
+
+def merged(options: RosOptions, others: RosOptions) -> RosOptions:
+    """Return options with those of `others` that are not the default."""
+    default = RosOptions()
+    given = {name: getattr(others, name) for name in others.__struct_fields__}
+    return msgspec.structs.replace(
+        options, **{name: value for name, value in given.items() if value != getattr(default, name)}
+    )
 
 
 def lookup(table: Mapping[str, T], topic: str) -> T | None:

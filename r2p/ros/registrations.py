@@ -47,14 +47,15 @@ class Registrations:
         }
         self._endpoints: dict[tuple[str, int | str], set[Registered]] = {}
         self._counts: Counter[str] = Counter()
-        self._refused: set[str] = set()
+        self.refused: set[str] = set()
+        """Nodes that are not shown, as others have their names."""
         self._add_nodes()
 
     def declare(self, name: str, role: int | str, endpoints: Collection[Registered]) -> None:
         """Have these endpoints of a topic or service in a role, and no others. New ones come first: no node ends in
         between.
         """
-        wanted = {each for each in endpoints if each.node not in self._refused}
+        wanted = {each for each in endpoints if each.node not in self.refused}
         before = self._endpoints.get((name, role), set())
         new, gone = _sorted(wanted - before), _sorted(before - wanted)
         self._counts.update(each.node for each in new)
@@ -82,12 +83,12 @@ class Registrations:
 
     def forget_node(self, node: str) -> None:
         """Remove a node for good: another one has its name."""
-        self._refused.add(node)
+        self.refused.add(node)
         for (name, role), endpoints in list(self._endpoints.items()):
             self.declare(name, role, endpoints)
 
     def _wanted(self) -> set[str]:
-        module = {self.module_node} - self._refused if self._keep_module_node or not self._counts else set()
+        module = {self.module_node} - self.refused if self._keep_module_node or not self._counts else set()
         return self._counts.keys() | module
 
     def _add_nodes(self) -> None:

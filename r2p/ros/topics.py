@@ -87,7 +87,8 @@ class TopicTypes:
 
     def stated(self, topic: str) -> type[Message] | None:
         """Return the class that the user states for a topic."""
-        return lookup(self._options.types, topic)
+        found = lookup(self._options.types, topic)
+        return found if isinstance(found, type) and issubclass(found, Message) else None
 
     def find(self, topic: str, cls: type[Message], peers: set[str]) -> RosTopic:
         """Return how a topic of this class travels. `peers` are the types that ROS nodes have for it, by name.
@@ -130,7 +131,7 @@ class TopicTypes:
         stamps = _HeaderStamps(shape, self._counts) if _has_header(shape) else None
         if self.version == 1:
             return RosTopic(shape, kind, _packed(stamps), _unpacked(shape))
-        return RosTopic(shape, kind, _to_cdr(shape, theirs, stamps), _from_cdr(shape, theirs))
+        return RosTopic(shape, kind, _to_cdr(theirs, stamps), _from_cdr(shape, theirs))
 
     def _converted(self, found: Conversion) -> RosTopic:
         shape, stamps = layout(found.ours), StampSource(found.ours, self._counts)
@@ -221,16 +222,15 @@ def _unpacked(shape: Layout[Any]) -> Callable[[bytes], Decoded]:
     return decode
 
 
-def _to_cdr(
-    shape: Layout[Any], theirs: type[Message], stamps: _HeaderStamps | None
-) -> Callable[[Sample], Sequence[bytes]]:
-    pack = cdr(theirs).encode
+def _to_cdr(theirs: type[Message], stamps: _HeaderStamps | None) -> Callable[[Sample], Sequence[bytes]]:
+    pack, decode = cdr(theirs).encode, layout(theirs).decode
 
     def encode(sample: Sample) -> Sequence[bytes]:
-        message = None if stamps is None else stamps.filled(sample)
-        if message is None:
-            message = sample.message
-        return (pack(shape.decode(sample.data) if message is None else message),)
+        filled = None if stamps is None else stamps.filled(sample)
+        message = sample.message if filled is None else filled
+        if type(message) is not theirs:
+            message = decode(sample.data if filled is None else filled.encode())
+        return (pack(message),)
 
     return encode
 

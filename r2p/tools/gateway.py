@@ -19,9 +19,10 @@ import typer
 
 import r2p
 from r2p.bridge import BridgeOptions, GatewayStatistics
-from r2p.bridge.options import check_prefix, is_link, is_topic_pattern, parse_rule
+from r2p.bridge.options import PREFIX_ON, check_prefix, is_link, is_topic_pattern, parse_rule
 from r2p.msg import GatewayStatus
 from r2p.names import module_name_from, topic_alias
+from r2p.tools import ros_gateway
 from r2p.tools.options import Format, Via, class_choice, hertz
 from r2p.tools.output import Output, aligned
 from r2p.tools.session import Settings, UsageError, check_urls, service, settings
@@ -54,7 +55,7 @@ _ReadOnly = Annotated[
 ]
 _Prefix = Annotated[str, typer.Option(metavar="robot1/", help="Prefix of the robot's topics on the network.")]
 _PrefixOn = Annotated[
-    _Rules, typer.Option(metavar="LINK", help="Links where the prefix applies; default: zenoh (repeatable).")
+    _Rules, typer.Option(metavar="LINK", help="Links where the prefix applies; default: zenoh and ROS (repeatable).")
 ]
 _Class = Annotated[
     _Rules,
@@ -83,6 +84,10 @@ async def command(
     class_: _Class = None,
     reserve: _Reserve = None,
     allow_control: _AllowControl = False,
+    type: ros_gateway.Type = None,
+    ros_type: ros_gateway.RosType = None,
+    ros_nodes: ros_gateway.RosNodes = False,
+    qos: ros_gateway.Qos = None,
     format: Format = None,
 ) -> None:
     """Join two or more links to one network, until Ctrl-C or SIGTERM.
@@ -102,19 +107,31 @@ async def command(
         rate_limit={topic: hertz(value) for topic, value in _pairs(rate_limit, "--rate-limit", "TOPIC=HZ")},
         read_only=_links(read_only, "--read-only", chosen.via),
         prefix=_prefix(prefix),
-        prefix_on=_links(prefix_on, "--prefix-on", chosen.via) or ("zenoh",),
+        prefix_on=_links(prefix_on, "--prefix-on", chosen.via) or PREFIX_ON,
         classes={topic: class_choice(value) for topic, value in _pairs(class_, "--class", "TOPIC=CLASS")},
         reserve=tuple(_topic(each, "--reserve") for each in reserve or ()),
         allow_control=allow_control,
     )
     _check_effect(options, chosen.via)
+    links = ros_gateway.open_links(chosen, ros_gateway.RosGatewayOptions(type, ros_type, qos, ros_nodes))
     own = name or chosen.module or f"GW_{module_name_from(socket.gethostname())[:4]}"
-    await serve(own, chosen, options, Output(format), quiet=format is None)
+    await serve(own, chosen, options, Output(format), links, quiet=format is None)
 
 
-async def serve(name: str, settings: Settings, options: BridgeOptions, output: Output, *, quiet: bool = False) -> None:
-    """Run a gateway on the links of `settings` until cancelled. `quiet`: print nothing where there is no terminal."""
-    async with r2p.Module(name, via=settings.via, aliases=settings.aliases, bridge=options) as module:
+async def serve(
+    name: str,
+    settings: Settings,
+    options: BridgeOptions,
+    output: Output,
+    links: list[Any] | None = None,
+    *,
+    quiet: bool = False,
+) -> None:
+    """Run a gateway on the links of `settings`, or on these ones, until cancelled.
+
+    `quiet`: print nothing where there is no terminal.
+    """
+    async with r2p.Module(name, via=links or settings.via, aliases=settings.aliases, bridge=options) as module:
         logger.info("gateway %s joins %s; Ctrl-C ends it", name, ", ".join(settings.via))
         module.start(_report, module, None if quiet and output.format != "text" else output, name="gateway")
         await module.wait()
@@ -146,11 +163,11 @@ def _check_effect(options: BridgeOptions, via: list[str]) -> None:
     kinds = {url.partition(":")[0] for url in via}
     if options.prefix and not any(_may_match(each, url) for each in options.prefix_on for url in via):
         raise UsageError(
-            f"--prefix {options.prefix} is for zenoh links, and there is none: choose with --prefix-on LINK"
+            f"--prefix {options.prefix} is for links to zenoh and ROS, and there is none: choose with --prefix-on LINK"
         )
-    if options.prefix_on != ("zenoh",) and not options.prefix:
+    if options.prefix_on != PREFIX_ON and not options.prefix:
         raise UsageError(f"--prefix-on {options.prefix_on[0]} needs a --prefix, such as robot1/")
-    if options.reserve and kinds <= {*_LINES, "zenoh", "memory"}:
+    if options.reserve and kinds <= {*_LINES, "zenoh", "memory", *ros_gateway.SCHEMES}:
         raise UsageError("--reserve is for slots on RTCAN, and there is no such link: add --via rtcan:can0")
     if options.classes and kinds.isdisjoint(_LINES):
         raise UsageError(f"--class is for debug lines, and there is none: the links are {', '.join(via)}")
@@ -190,7 +207,10 @@ def _topic(pattern: str, option: str) -> str:
 
 
 class Row(msgspec.Struct, frozen=True):
-    """One line of the table: a link (`topic` and `target` are empty), or a topic and its route."""
+    """One line of the table: a link (`topic` and `target` are empty), or a topic and its route.
+
+    `not_carried` has topics that a link does not carry, and why: those that are not on ROS.
+    """
 
     topic: str
     source: str
@@ -202,6 +222,7 @@ class Row(msgspec.Struct, frozen=True):
     dropped: dict[str, int]
     offset: int | None = None
     error: int | None = None
+    not_carried: dict[str, str] = {}
 
     def status(self) -> GatewayStatus:
         """Return the line as a message."""
@@ -245,7 +266,10 @@ class RateCounter:
         since = (now - self._at) / 1e9
         last, self._last, self._at = self._last, {}, now
         rows = [
-            Row("", each.link, "", each.state, each.gateways, 0.0, 0, each.dropped, each.offset, each.error)
+            Row(
+                *("", each.link, "", each.state, each.gateways, 0.0, 0, each.dropped, each.offset, each.error),
+                each.not_carried,
+            )
             for each in statistics.ports
         ]
         for route in statistics.routes:
@@ -308,9 +332,20 @@ def table(rows: list[Row]) -> str:
     if routes:
         columns = ["topic", "from", "to", "rate", "forwarded", "dropped"]
         text += "\n" + aligned([row.cells(names) for row in routes[:_ROWS]], columns)
+    text += "".join(_not_carried(row, names) for row in rows if row.not_carried)
     if len(routes) > _ROWS:
         text += f"... and {len(routes) - _ROWS} more\n"
     return text
+
+
+def _not_carried(row: Row, names: Mapping[str, str]) -> str:
+    """Say which topics a link does not carry, a line for each reason."""
+    by_reason: dict[str, list[str]] = {}
+    for topic, reason in sorted(row.not_carried.items()):
+        by_reason.setdefault(reason, []).append(topic)
+    link = names.get(row.source, row.source)
+    lines = (f"not on {link}: {', '.join(topics)}: {reason}" for reason, topics in by_reason.items())
+    return "\n" + "\n".join(lines) + "\n"
 
 
 async def _report(node: r2p.Node, module: r2p.Module, output: Output | None) -> None:

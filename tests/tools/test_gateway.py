@@ -12,7 +12,7 @@ import typer
 
 import r2p
 from r2p.bridge import BridgeOptions, GatewayStatistics, PortStatistics, RouteStatistics
-from r2p.bridge.options import Policy
+from r2p.bridge.options import PREFIX_ON, Policy
 from r2p.msg import GatewayStatus, Led
 from r2p.testing.network import node_in
 from r2p.tools import gateway
@@ -165,7 +165,7 @@ def test_mistakes_are_told() -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (BridgeOptions(prefix="robot1/"), "--prefix robot1/ is for zenoh links, and there is none"),
+        (BridgeOptions(prefix="robot1/"), "--prefix robot1/ is for links to zenoh and ROS, and there is none"),
         (BridgeOptions(prefix_on=("memory:lab",)), "--prefix-on memory:lab needs a --prefix"),
         (BridgeOptions(reserve=("imu",)), "--reserve is for slots on RTCAN, and there is no such link"),
         (BridgeOptions(classes={"imu": class_choice("nrt")}), "--class is for debug lines, and there is none"),
@@ -175,5 +175,5 @@ def test_options_without_effect(options: BridgeOptions, text: str) -> None:
     with pytest.raises(UsageError, match=text):
         gateway._check_effect(options, ["memory:robot", "memory:lab"])
     here = ["memory:lab", "tcp:robot", "sim:bus", "zenoh:"]
-    if options.prefix_on == ("zenoh",):
+    if options.prefix_on == PREFIX_ON:
         gateway._check_effect(options, here)
