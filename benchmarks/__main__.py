@@ -17,6 +17,7 @@ ALL = (
     "zenoh_images",
     "gateway",
     "rtcan",
+    "ros1",
     "timers",
     "start",
     "socketcan",

@@ -6,7 +6,7 @@ import functools
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Annotated
@@ -17,8 +17,12 @@ from benchmarks.ends import Result
 from benchmarks.loops import run_on
 from benchmarks.processes import process
 from benchmarks.table import Row, p50_p99, rate, typical
+from r2p.ros.middleware import RosArrival, RosEndpoint, RosType
+from r2p.ros.ros1.environment import RosAddress
+from r2p.ros.ros1.middleware import Ros1Middleware
 from tests.ros.ros1 import packages
 from tests.ros.ros1.programs import Ros1, RospyPeer
+from tests.ros.ros1.recorder import Recorder
 
 MESSAGES = 50_000
 ROUNDS = 5_000
@@ -51,7 +55,7 @@ def rows() -> Iterator[Row]:
         yield _throughput("TCPROS into async for, from r2p", ours, lost, "into a rospy callback", to_rospy)
         yield _throughput("TCPROS out of publish(), to r2p", ours, lost, "out of rospy's publish()", from_rospy)
         yield Row("rospy to rospy, 60 bytes", rate(theirs), f"r2p to r2p {ours / theirs:.1f}x", "", None)
-        yield _round_trip(trips, _bare_trips(), _rospy_trips(ros1))
+        yield from _round_trips(trips, _plain_trips(ros1), _bare_trips(), _rospy_trips(ros1))
 
 
 def _throughput(what: str, ours: float, lost: int, baseline: str, theirs: float) -> Row:
@@ -59,14 +63,22 @@ def _throughput(what: str, ours: float, lost: int, baseline: str, theirs: float)
     return Row(f"{what}, 60 bytes", f"{rate(ours)}, {lost} lost", text, "1x", ours >= theirs and not lost)
 
 
-def _round_trip(ours: list[float], bare: list[float], rospy: list[float]) -> Row:
-    (median, worst), (echo, _), (theirs, _) = p50_p99(ours), p50_p99(bare), p50_p99(rospy)
-    return Row(
-        "round trip over TCPROS, typed, 60 bytes, p50, p99",
+def _round_trips(typed: list[float], plain: list[float], bare: list[float], rospy: list[float]) -> Iterator[Row]:
+    (median, worst), (echo, _), (theirs, _) = p50_p99(plain), p50_p99(bare), p50_p99(rospy)
+    yield Row(
+        "round trip over TCPROS, 60 bytes, p50, p99",
         f"{median:.0f} us, {worst:.0f} us",
-        f"bare echo, uvloop {echo:.0f} us: {median / echo:.2f}x, rospy {theirs:.0f} us",
+        f"bare echo, uvloop {echo:.0f} us: {median / echo:.2f}x",
         "p50 within 1.3x",
         median <= 1.3 * echo,
+    )
+    median, worst = p50_p99(typed)
+    yield Row(
+        "... typed, between nodes of two modules",
+        f"{median:.0f} us, {worst:.0f} us",
+        f"{median / echo:.2f}x; between rospy's nodes {theirs:.0f} us",
+        "p50 below rospy's",
+        median <= theirs,
     )
 
 
@@ -153,6 +165,78 @@ async def _rospy_to_rospy(one: RospyPeer, two: RospyPeer) -> float:
 
 
 # Round trips
+
+
+class _Echo(Recorder):
+    """Sends each message back, or waits for it."""
+
+    def __init__(self, middleware: Ros1Middleware, to: str) -> None:
+        super().__init__()
+        self.joined = asyncio.Event()
+        self.came: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._middleware = middleware
+        self._to = to
+
+    def received(self, messages: list[RosArrival]) -> None:
+        for each in messages:
+            if self._to:
+                self._middleware.publish("/echo", self._to, each.data, 0)
+            elif not self.came.done():
+                self.came.set_result(None)
+
+    def subscriber_joined(self, topic: str) -> None:
+        self.joined.set()
+
+
+def _plain_trips(ros1: Ros1) -> list[float]:
+    """Round trips of TCPROS alone, from one middleware to another one and back."""
+    with process(_echo_process, ros1.uri) as server:
+        server.recv()
+        return run_on("uvloop", _plain_ping(ros1.uri))
+
+
+def _echo_process(pipe: Connection, uri: str) -> None:
+    async def main() -> None:
+        async with _middleware(uri, "/echo", "/plain_ping", "/plain_pong", echoes=True):
+            pipe.send("ready")
+            await asyncio.get_running_loop().create_future()
+
+    run_on("uvloop", main())
+
+
+async def _plain_ping(uri: str) -> list[float]:
+    trips = []
+    async with _middleware(uri, "/ping", "/plain_pong", "/plain_ping", echoes=False) as (middleware, user):
+        await user.joined.wait()
+        while not user.came.done():  # until both ways are connected
+            middleware.publish("/ping", "/plain_ping", bytes(60), 0)
+            await asyncio.sleep(0.05)
+        for _ in range(ROUNDS):
+            user.came = asyncio.get_running_loop().create_future()
+            at = time.perf_counter()
+            middleware.publish("/ping", "/plain_ping", bytes(60), 0)
+            await user.came
+            trips.append(time.perf_counter() - at)
+    return trips
+
+
+@contextlib.asynccontextmanager
+async def _middleware(
+    uri: str, node: str, takes: str, gives: str, *, echoes: bool
+) -> AsyncIterator[tuple[Ros1Middleware, _Echo]]:
+    kind = RosType(KIND, "992ce8a1687cec8c8bd883ec73ca41d1")
+    middleware = Ros1Middleware(RosAddress(uri, "127.0.0.1", "127.0.0.1"))
+    middleware.add_node(node)
+    middleware.advertise(RosEndpoint(node, gives, kind))
+    middleware.subscribe(RosEndpoint(node, takes, kind))
+    user = _Echo(middleware, gives if echoes else "")
+    running = asyncio.ensure_future(middleware.run(user, lambda: None))
+    try:
+        yield middleware, user
+    finally:
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
 
 
 def _rospy_trips(ros1: Ros1) -> list[float]:

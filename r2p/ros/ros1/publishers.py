@@ -10,6 +10,7 @@ publishers wait, unless it has read nothing for SLOW_S: then it is slow, and onl
 import asyncio
 from collections import deque
 
+from r2p.clock import clock_of
 from r2p.ros.middleware import RosEndpoint
 from r2p.ros.ros1.connections import Ros1Context, TcprosConnection, take_over
 from r2p.ros.ros1.tcpros import Fields, encode_header, frame, publisher_header, refuse_subscriber
@@ -21,6 +22,7 @@ QUEUE_BYTES_MAX = 64 << 20
 """Bytes that wait for one subscriber at most, whatever the depth of its queue; one message more if it is empty."""
 
 _TURN_BYTES = 64 * 1024  # bytes that are gathered in one turn of the event loop before the socket is tried
+_GATHER = 20_000  # ns after a write in which a further message waits for others: a write takes about as long
 TOO_SLOW = "ROS subscriber too slow"
 """The reason of messages that were dropped as a subscriber did not read them in time."""
 
@@ -41,12 +43,15 @@ class SubscriberConnection(TcprosConnection):
         self._queue: deque[bytes] = deque()
         self._queued = 0  # bytes
         self._paused = False
-        self._turn: list[bytes] | None = None  # what follows the first message of this turn of the loop
+        self._turn: list[bytes] | None = None  # what goes out at the end of this turn of the loop
         self._turn_bytes = 0
         self._timer: asyncio.TimerHandle | None = None
         self._unsent = 0  # bytes that the socket had not accepted when the timer was started
         self._emptied = False  # True if it has accepted all of them since
         self._loop = asyncio.get_running_loop()
+        self._monotonic = clock_of(self._loop).monotonic
+        self._sent_at = self._monotonic() - _GATHER  # ns
+        self._many = False  # True if several messages went out at the end of the last turn with any
 
     @property
     def topic(self) -> str:
@@ -55,19 +60,21 @@ class SubscriberConnection(TcprosConnection):
     def send(self, data: bytes) -> None:
         """Send a frame, or let it wait.
 
-        The first one of a turn of the loop goes out at once; those that follow in the same turn go out together.
+        It goes out at once, unless one has gone out just now, or several did in the last turn of the loop: then it does
+        at the end of this turn, with all that come until then.
         """
         if self._paused:
             self._keep(data)
-        elif self._turn is None:
-            self._turn = []
-            self._loop.call_soon(self._end_turn)
-            self._write(data, 1)
-        else:
+        elif self._turn is not None:
             self._turn.append(data)
             self._turn_bytes += len(data)
             if self._turn_bytes > _TURN_BYTES:
                 self._flush_turn()
+        elif self._many or self._monotonic() - self._sent_at < _GATHER:
+            self._turn = [data]
+            self._loop.call_soon(self._end_turn)
+        else:
+            self._write(data, 1)
 
     @property
     def has_room(self) -> bool:
@@ -118,8 +125,10 @@ class SubscriberConnection(TcprosConnection):
             self.sent += messages
             self.bytes_sent += len(data)
             self.transport.write(data)
+            self._sent_at = self._monotonic()
 
     def _end_turn(self) -> None:
+        self._many = len(self._turn or ()) > 1
         self._flush_turn()
         self._turn = None
 
@@ -185,6 +194,7 @@ class Ros1Publication:
         self.connections: list[SubscriberConnection] = []
         self.last: bytes | None = None
         """The frame of the last message, if the topic is latched."""
+        self._latched = endpoint.qos.transient_local
 
     @property
     def topic(self) -> str:
@@ -203,7 +213,7 @@ class Ros1Publication:
     def publish(self, data: bytes | memoryview) -> None:
         """Send a message to all subscribers."""
         framed = frame(data)
-        if self.endpoint.qos.transient_local:
+        if self._latched:
             self.last = framed
         for connection in self.connections:
             connection.send(framed)

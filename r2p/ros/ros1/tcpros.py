@@ -70,7 +70,7 @@ def encode_error(text: str) -> bytes:
 
 def frame(data: bytes | memoryview) -> bytes:
     """Return a message as it is sent."""
-    return b"".join((_LENGTH.pack(len(data)), data))
+    return _LENGTH.pack(len(data)) + data
 
 
 def encode_response(data: bytes) -> bytes:
@@ -108,7 +108,11 @@ class FrameReader:
         """Return all frames that are complete now, in order."""
         if self.broken:
             return []
-        if self._rest:
+        size = len(data)
+        if not self._rest:
+            if size >= 4 and _LENGTH.unpack_from(data)[0] == size - 4 <= self.limit:
+                return [data[4:]]  # one message and nothing else, as it most often is
+        else:
             self._rest += data
             if not self._is_complete():
                 return []
