@@ -152,7 +152,6 @@ class ActionServer(HandlerOwner, Generic[G, R, F]):
         node, types, name = self._node, self.types, self.name
         self._feedback = node.advertise(f"{name}/{FEEDBACK}", types.feedback_message)
         self._status = node.advertise(f"{name}/{STATUS}", GoalStatusArray, latch=True)
-        self._publish_status()
         self._services = [
             node.serve(f"{name}/{GET_RESULT}", types.get_result, self._get_result, limit=_ASKING_MAX),
             node.serve(f"{name}/{CANCEL_GOAL}", CancelGoal, self._cancel_goal),

@@ -253,7 +253,7 @@ async def test_a_client_that_is_a_ros_node() -> None:
         assert (result.status, result.result) == (GoalState.SUCCEEDED, Count.Result((0, 1, 2)))
         assert [each.feedback.number for each in feedback] == [0, 1, 2]
         states = [[status.status for status in each.status_list] for each in statuses]
-        assert states == [[], [GoalState.ACCEPTED], [GoalState.EXECUTING], [GoalState.SUCCEEDED]]
+        assert states == [[GoalState.ACCEPTED], [GoalState.EXECUTING], [GoalState.SUCCEEDED]]
         assert statuses[-1].status_list[0].goal_info == GoalInfo(goal_id, answer.stamp)
         for request, code in (
             (CancelGoal.Request(GoalInfo(goal_id)), CancelCode.TERMINATED),

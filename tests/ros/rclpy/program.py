@@ -12,6 +12,7 @@ import importlib
 import json
 import sys
 import threading
+import time
 from array import array
 from pathlib import Path
 from typing import Any
@@ -217,14 +218,31 @@ class Peer:
         finally:
             self.nodes[node].destroy_client(client)
 
-    def act(self, node: str, action: str, type: str, feedback: list[dict[str, Any]], result: dict[str, Any]) -> None:
-        """Serve an action: every goal gets this feedback and this result; a cancellation is accepted."""
+    def act(
+        self,
+        node: str,
+        action: str,
+        type: str,
+        feedback: list[dict[str, Any]],
+        result: dict[str, Any],
+        patience: float = 0.0,
+    ) -> None:
+        """Serve an action: every goal gets this feedback and this result; a cancellation is accepted.
+
+        It waits for one up to `patience` seconds.
+        """
         cls = interface(type)
 
         def execute(goal: Any) -> Any:
             for each in feedback:
                 goal.publish_feedback(fill(cls.Feedback(), each))
-            goal.succeed()
+            until = time.monotonic() + patience
+            while time.monotonic() < until and not goal.is_cancel_requested:
+                time.sleep(0.01)
+            if goal.is_cancel_requested:
+                goal.canceled()
+            else:
+                goal.succeed()
             return fill(cls.Result(), result)
 
         self.entities[f"{node} act {action}"] = ActionServer(
