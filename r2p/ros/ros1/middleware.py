@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable
 
 from r2p.clock import Backoff
 from r2p.errors import NoServer
-from r2p.ros.middleware import Middleware, MiddlewareUser, RosEndpoint, RosServer, RosService
+from r2p.ros.middleware import Middleware, MiddlewareUser, RosEndpoint, RosPeerEndpoint, RosServer, RosService
 from r2p.ros.ros1.connections import Ros1Context, TcprosConnection, TcprosListener
 from r2p.ros.ros1.environment import RosAddress
 from r2p.ros.ros1.master import MasterError
@@ -24,7 +24,7 @@ from r2p.ros.ros1.publishers import Ros1Publication, SubscriberConnection
 from r2p.ros.ros1.registration import MasterSession
 from r2p.ros.ros1.services import Ros1Callers, Ros1Server
 from r2p.ros.ros1.slave import BusConnection
-from r2p.ros.ros1.subscribers import PublisherConnection, Ros1Subscription
+from r2p.ros.ros1.subscribers import PublisherConnection, Ros1Subscription, definition_of
 from r2p.ros.ros1.tcpros import ANY
 from r2p.ros.ros1.xmlrpc import XmlRpcError
 
@@ -149,6 +149,14 @@ class Ros1Middleware(Middleware):
             if subscription.type != before:
                 subscription.reconnect()
             self._connect(subscription)
+
+    async def describe(self, endpoint: RosPeerEndpoint) -> str:
+        session, node = self._session, next(iter(self._listeners), "/r2p")
+        try:
+            uri = await session.master.lookup_node(node, endpoint.node)
+            return await definition_of(self._context, session.client, uri, node, endpoint.topic)
+        except (OSError, XmlRpcError, MasterError):  # a subscriber, or a node that has just ended
+            return ""
 
     def pause(self) -> None:
         self._context.paused = True

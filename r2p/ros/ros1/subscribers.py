@@ -11,7 +11,7 @@ from r2p.clock import Backoff
 from r2p.ros.middleware import RosArrival, RosEndpoint, RosType
 from r2p.ros.ros1.connections import Ros1Context, TcprosConnection
 from r2p.ros.ros1.slave import request_topic
-from r2p.ros.ros1.tcpros import MESSAGE_MAX, Fields, encode_header, refuse_publisher, subscriber_header
+from r2p.ros.ros1.tcpros import ANY, MESSAGE_MAX, Fields, encode_header, refuse_publisher, subscriber_header
 from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError
 
 CONNECT_S = 5.0
@@ -96,6 +96,41 @@ class PublisherConnection(TcprosConnection):
         text = f"{self.node or self.uri}: [{self._subscription.topic}]: a message is too long: {self.reader.broken}"
         self.context.user.notice(f"too long: {self._subscription.topic}", text, trouble=True)
         self.abort()
+
+
+class DefinitionQuery(TcprosConnection):
+    """A connection that is made for the definition of a publisher's type only."""
+
+    def __init__(self, context: Ros1Context, node: str, topic: str) -> None:
+        super().__init__(context)
+        self.definition = ""
+        """The definition; empty if the publisher did not give it."""
+        self._header = subscriber_header(node, topic, RosType(ANY, ANY))
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        assert self.transport is not None
+        self.transport.write(encode_header(self._header))
+
+    def on_header(self, fields: Fields) -> None:
+        self.definition = fields.get("message_definition", "")
+        self.abort()
+
+
+async def definition_of(context: Ros1Context, client: XmlRpcClient, uri: str, node: str, topic: str) -> str:
+    """Ask the publisher with this slave URI for the definition of its type, as a node of this side.
+
+    Raises XmlRpcError if it does not publish the topic, and OSError if it can't be reached.
+    """
+    host, port = await request_topic(client, uri, node, topic, CONNECT_S)
+    query = DefinitionQuery(context, node, topic)
+    try:
+        async with asyncio.timeout(CONNECT_S):
+            await asyncio.get_running_loop().create_connection(lambda: query, host, port)
+            await query.ended
+    finally:
+        query.abort()
+    return query.definition
 
 
 class Ros1Subscription:

@@ -15,7 +15,11 @@ if TYPE_CHECKING:
     from r2p.tools.checks import Check
     from tests.ros.ros1.programs import Ros1
 
-pytestmark = [pytest.mark.xdist_group("ros1"), pytest.mark.anyio]
+pytestmark = [
+    pytest.mark.xdist_group("ros1"),
+    pytest.mark.anyio,
+    pytest.mark.parametrize("anyio_backend", [("asyncio", {"use_uvloop": True})], ids=["uvloop"]),
+]
 
 
 async def _checks(url: str) -> list[Check]:
@@ -56,7 +60,7 @@ async def test_no_master(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "ROS_MASTER_URI" in check.found
 
 
-def test_an_address_that_leads_nowhere() -> None:
+async def test_an_address_that_leads_nowhere() -> None:
     own = ros_checks.own_address
     assert own("127.0.0.1", "http://localhost:11311").ok
     loopback = own("127.0.0.1", "http://192.0.2.1:11311")
