@@ -15,6 +15,7 @@ ALL = (
     "network",
     "zenoh",
     "zenoh_images",
+    "ros2",
     "gateway",
     "rtcan",
     "ros1",

@@ -73,9 +73,14 @@ def _drive_r2p(port: int, pipe: Connection) -> Result:
 def bare_listener(*, shm: bool = True) -> Iterator[tuple[zenoh.Session, int]]:
     """A session, and the port where it accepts connections."""
     with zenoh.open(_config("peer", "listen", 0, shm=shm)) as session:
-        answers = [each.ok for each in session.get(f"@/{session.zid()}/*") if each.ok is not None]
-        (locator,) = [each for answer in answers for each in json.loads(answer.payload.to_bytes()).get("locators", [])]
-        yield session, int(locator.rpartition(":")[2])
+        yield session, port_of_session(session)
+
+
+def port_of_session(session: zenoh.Session) -> int:
+    """The port where a session with an admin space accepts connections."""
+    answers = [each.ok for each in session.get(f"@/{session.zid()}/*") if each.ok is not None]
+    (locator,) = [each for answer in answers for each in json.loads(answer.payload.to_bytes()).get("locators", [])]
+    return int(locator.rpartition(":")[2])
 
 
 def bare_client(port: int, *, shm: bool = True) -> zenoh.Session:
