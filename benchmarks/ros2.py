@@ -18,6 +18,7 @@ from r2p.ros.std_srvs import SetBool
 MESSAGES = 100_000
 ROUNDS = 3_000
 CALLS = 2_000
+RUNS = 3
 SETTLED = 0.3  # seconds in which messages arrive that are on the way
 OURS, ROS = "zenoh:tcp/127.0.0.1:{}?scouting=off&network=bench&batching=off", "ros2:tcp/127.0.0.1:{}"
 
@@ -166,11 +167,13 @@ def _measure(port: int, via: str) -> Measured:
 def rows() -> Iterator[Row]:
     with process(_route) as router:
         port = router.recv()
-        ros, ours = _measure(port, ROS), _measure(port, OURS)
+        pairs = [(_measure(port, ROS), _measure(port, OURS)) for _ in range(RUNS)]
+    # The run in the middle: on two cores, much depends on which of three processes runs when.
+    ros, ours = sorted(pairs, key=lambda pair: pair[0].rate / pair[1].rate)[RUNS // 2]
     yield Row(
         "two processes over ROS 2 by zenoh, typed, 64 bytes, into `async for`",
-        f"{rate(ros.rate)}, {ros.lost} lost",
-        f"zenoh: without batching {rate(ours.rate)}, {ours.lost} lost: {ros.rate / ours.rate:.2f}x",
+        f"{rate(ros.rate)}, {ros.lost / MESSAGES:.0%} lost",  # nothing makes a publisher wait in ROS 2
+        f"zenoh: without batching {rate(ours.rate)}: {ros.rate / ours.rate:.2f}x",
         "1/1.3 of it",
         ros.rate * 1.3 >= ours.rate,
     )

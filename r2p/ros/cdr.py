@@ -95,6 +95,29 @@ def cdr(cls: type[Message]) -> CdrCodec:
     return CdrCodec(functions["encode"], functions["decode"])
 
 
+def packed_size(cls: type[Message]) -> int:
+    """Return the size of messages whose CDR is their packing behind HEADER, as nothing has to be aligned; 0 for a class
+    with others.
+    """
+    shape = layout(cls)
+    return shape.size if shape.exact_size and _end_if_aligned(Nested(shape), 0) == shape.size else 0
+
+
+def _end_if_aligned(shape: Shape, at: int) -> int:
+    """Return the offset behind a value of fixed size; -1 if there is padding before or in it, or if it has no bytes."""
+    match shape:
+        case _ if at < 0 or not shape.size:
+            return -1
+        case Nested(inner):
+            return functools.reduce(lambda end, field: _end_if_aligned(field.shape, end), inner.fields, at)
+        case FixedArray(item, count, "tuple"):
+            return functools.reduce(lambda end, _: _end_if_aligned(item, end), range(count), at)
+        case FixedArray(item) | (Scalar() as item):
+            return at + shape.size if not at % item.size else -1
+        case _:
+            return at + shape.size
+
+
 @functools.lru_cache(maxsize=1024)
 def _element(shape: Shape, is_wide: bool) -> tuple[Callable[..., int], Callable[..., tuple[Any, int]]]:
     """Return the functions that write and read an element of an array, at any offset."""

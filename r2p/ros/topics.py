@@ -15,7 +15,7 @@ import msgspec
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import Layout, Message, Timestamp, layout
 from r2p.names import BUS_LOAD, BUS_SLOTS, LOADER_PREFIX, RESERVED
-from r2p.ros.cdr import cdr
+from r2p.ros.cdr import HEADER, cdr, packed_size
 from r2p.ros.classes import RosTypes, definitions_of, standard_classes
 from r2p.ros.conversions import Conversion, RosNames, conversion, standard_type
 from r2p.ros.definitions import definition_text, parse, short_name
@@ -224,6 +224,8 @@ def _unpacked(shape: Layout[Any]) -> Callable[[bytes], Decoded]:
 
 def _to_cdr(theirs: type[Message], stamps: _HeaderStamps | None) -> Callable[[Sample], Sequence[bytes]]:
     pack, decode = cdr(theirs).encode, layout(theirs).decode
+    if packed_size(theirs):  # it has no header with a stamp: there is a text in that
+        return lambda sample: (HEADER + sample.data,)
 
     def encode(sample: Sample) -> Sequence[bytes]:
         filled = None if stamps is None else stamps.filled(sample)
@@ -236,11 +238,17 @@ def _to_cdr(theirs: type[Message], stamps: _HeaderStamps | None) -> Callable[[Sa
 
 
 def _from_cdr(shape: Layout[Any], theirs: type[Message]) -> Callable[[bytes], Decoded]:
-    unpack, is_same = cdr(theirs).decode, theirs is shape.cls
+    unpack, is_same, stamps = cdr(theirs).decode, theirs is shape.cls, StampSource(theirs, Counter())
+    pack, size = layout(theirs).encode, packed_size(theirs) if is_same else 0
+    begin, end = len(HEADER), len(HEADER) + size
 
     def decode(data: bytes) -> Decoded:
-        message = unpack(data)
-        packed = shape.encode(message) if is_same else layout(theirs).encode(message)
-        return packed, message if is_same else None, _utc(stamp_of(message))
+        if size and len(data) >= end and data[:begin] == HEADER:
+            packed, message = data[begin:end], None
+        else:
+            message = unpack(data)
+            packed = pack(message)
+        own = stamps.own(packed)
+        return packed, message if is_same else None, own if own >= StampSource.OLDEST_UTC else 0
 
     return _guarded(decode)

@@ -33,9 +33,9 @@ NO_HASH = "TypeHashNotSupported"
 """What ROS 2 Humble has in place of a type's hash."""
 
 GID_BYTES = 16
-ATTACHMENT_BYTES = 33
+ATTACHMENT = struct.Struct("<qqB16s")
+"""Sequence number, time in ns, GID_BYTES, and the gid."""
 
-_ATTACHMENT = struct.Struct("<qqB16s")
 _START = struct.Struct("<qqB")
 _TOKEN_MAX = 2048  # characters; names in ROS have at most 255
 _NODE_FIELDS, _ENDPOINT_FIELDS = 9, 13
@@ -155,15 +155,15 @@ def _decode_endpoint(fields: list[str]) -> tuple[str, str, str, Qos]:
 
 def encode_attachment(sequence: int, stamp: int, gid: bytes) -> bytes:
     """Return the attachment of a message, a request or a response; `stamp` in ns."""
-    return _ATTACHMENT.pack(sequence, stamp, GID_BYTES, gid)
+    return ATTACHMENT.pack(sequence, stamp, GID_BYTES, gid)
 
 
 def decode_attachment(data: bytes) -> tuple[int, int, bytes]:
     """Return the sequence number, the time in ns, and the gid, which is short or empty from some clients. What follows
     it belongs to later versions. Raises DecodeError.
     """
-    if len(data) == ATTACHMENT_BYTES:  # of nearly every message
-        sequence, stamp, size, gid = _ATTACHMENT.unpack(data)
+    if len(data) == ATTACHMENT.size:  # of nearly every message
+        sequence, stamp, size, gid = ATTACHMENT.unpack(data)
         if size == GID_BYTES:
             return sequence, stamp, gid
     if len(data) < _START.size:

@@ -6,6 +6,7 @@ for their fragments, and those of publishers that keep all, for which it waits f
 """
 
 import functools
+import struct
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -17,6 +18,8 @@ from r2p.errors import DecodeError
 from r2p.messages import SIZE_MAX
 from r2p.ros.middleware import Qos, RosArrival, RosEndpoint
 from r2p.ros.ros2.keys import (
+    ATTACHMENT,
+    GID_BYTES,
     EntityKind,
     RmwToken,
     data_key,
@@ -38,8 +41,10 @@ if TYPE_CHECKING:
 _CACHE_DEFAULT = 42  # messages that a transient local publisher keeps that keeps all, as in rmw_zenoh
 _CACHE_MAX = 10_000
 _HEARTBEAT_S = 0.5  # seconds after which a subscriber of a transient local topic learns what it has missed
-_RING_MIN, _RING_MAX = 512, 4096  # messages of one topic that wait in zenoh; of more, the oldest are lost
+_RING_MIN, _RING_MAX = 1024, 4096  # messages of one topic that wait in zenoh; of more, the oldest are lost
 _ATTACHMENT_MAX = 512  # bytes; longer ones are not read
+_BATCH = MESSAGES_PER_TURN // 2  # messages that are delivered at once: the link does not pause for them
+_unpack = ATTACHMENT.unpack
 _GAP_MAX = 1 << 24  # messages missed at once; more is a number that does not count
 _GIDS_MAX = 1024  # publishers of one topic whose nodes are remembered
 
@@ -216,7 +221,7 @@ class RmwSubscription:
             self._held, self._stopped = sample, True
             return
         arrivals: list[RosArrival] = []
-        while sample is not None and len(arrivals) < MESSAGES_PER_TURN:
+        while sample is not None and len(arrivals) < _BATCH:
             try:
                 arrival = self._arrival(sample)
             except DecodeError as error:
@@ -245,21 +250,26 @@ class RmwSubscription:
     def _arrival(self, sample: zenoh.Sample) -> RosArrival | None:
         """Return a message; None for one that was received before. Raises DecodeError, with the reason to count."""
         header, payload = sample.attachment, sample.payload
-        if sample.kind != zenoh.SampleKind.PUT or len(payload) > SIZE_MAX:
-            raise DecodeError("too long" if len(payload) > SIZE_MAX else "not a message")
+        if not 0 < len(payload) <= SIZE_MAX:
+            raise DecodeError("too long" if payload else "empty")
         if header is None or len(header) > _ATTACHMENT_MAX:
             raise DecodeError("wrong attachment")
-        try:
-            sequence, stamp, gid = decode_attachment(header.to_bytes())
-        except DecodeError:
-            raise DecodeError("wrong attachment") from None
+        data = header.to_bytes()
+        try:  # that of rmw_zenoh without a call
+            sequence, stamp, gid_size, gid = _unpack(data)
+        except struct.error:
+            gid_size = 0
+        if gid_size != GID_BYTES:
+            sequence, stamp, gid = _decode_unusual(data)
         publisher = self._publishers.get(gid)
         if publisher is None or publisher.graph_version != self._session.graph.version:
             publisher = self._look_up(gid, publisher)
         if sequence != publisher.sequence + 1 and self._was_received(sequence, publisher.sequence):
             return None
         publisher.sequence = sequence
-        return RosArrival(self._encoded, payload.to_bytes(), publisher.node, max(sequence, 0), max(stamp, 0), gid)
+        if sequence < 0 or stamp < 0:
+            sequence, stamp = max(sequence, 0), max(stamp, 0)
+        return RosArrival(self._encoded, payload.to_bytes(), publisher.node, sequence, stamp, gid)
 
     def _was_received(self, sequence: int, last: int) -> bool:
         """Return whether a transient local publisher's message came before; count those missed before this one."""
@@ -276,6 +286,13 @@ class RmwSubscription:
         node = graph.node_of(gid, EntityKind.PUBLISHER, self.topic)
         found = self._publishers[gid] = RmwRemotePublisher(node, graph.version, sequence)
         return found
+
+
+def _decode_unusual(data: bytes) -> tuple[int, int, bytes]:
+    try:
+        return decode_attachment(data)
+    except DecodeError:
+        raise DecodeError("wrong attachment") from None
 
 
 def _declare_subscriber(session: zenoh.Session, key: str, qos: Qos) -> Any:
