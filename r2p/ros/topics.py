@@ -239,7 +239,7 @@ def _to_cdr(theirs: type[Message], stamps: _HeaderStamps | None) -> Callable[[Sa
 
 def _from_cdr(shape: Layout[Any], theirs: type[Message]) -> Callable[[bytes], Decoded]:
     unpack, is_same, stamps = cdr(theirs).decode, theirs is shape.cls, StampSource(theirs, Counter())
-    pack, size = layout(theirs).encode, packed_size(theirs) if is_same else 0
+    pack, size = layout(theirs).encode, packed_size(theirs)
     begin, end = len(HEADER), len(HEADER) + size
 
     def decode(data: bytes) -> Decoded:
