@@ -24,6 +24,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "loader",
         "ros",
         "ros.ros1",
+        "ros.ros2",
+        "ros.dds",
     ),
     "Modules": ("modules", "bus"),
     "Gateways": ("bridge",),

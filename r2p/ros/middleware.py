@@ -9,7 +9,7 @@ as ROS serialises them: packed in ROS 1, CDR behind its header of 4 bytes in ROS
 import abc
 from collections import Counter
 from collections.abc import Awaitable, Callable
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import msgspec
 
@@ -186,6 +186,8 @@ class Middleware(abc.ABC):
 
     version: int
     """1 or 2."""
+    has_services: ClassVar[bool] = True
+    """Whether services can be served and called; else there are topics only."""
     lost: Counter[str]
     """The link's counter of losses, by reason."""
 

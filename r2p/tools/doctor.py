@@ -33,7 +33,14 @@ from r2p.tools.session import Session, Settings, UsageError, check_urls, join, s
 from r2p.transports.can.netlink import ARPHRD_CAN, Interface, has_socketcan, list_interfaces
 from r2p.units import MILLISECOND
 
-EXTRAS = {"can": "python-can", "elf": "pyelftools", "ros": "rosbags", "serial": "pyserial", "zenoh": "eclipse-zenoh"}
+EXTRAS = {
+    "can": "python-can",
+    "dds": "cyclonedds",
+    "elf": "pyelftools",
+    "ros": "rosbags",
+    "serial": "pyserial",
+    "zenoh": "eclipse-zenoh",
+}
 """The extras of r2p, and the package of each."""
 
 _ROOT = Path("/")

@@ -33,11 +33,12 @@ BUILT_IN = {
     "sim": "r2p.sim.transport:from_url",
     "zenoh": "r2p.transports.zenoh:from_url",
     "ros2": "r2p.ros.ros2:from_url",
+    "dds": "r2p.ros.dds:from_url",
 }
 
 GROUP = "r2p.transports"
 
-_IP = frozenset({"ros1", "tcp", "tcp-listen", "zenoh", "ros2"})
+_IP = frozenset({"dds", "ros1", "ros2", "tcp", "tcp-listen", "zenoh"})
 
 _OPTIONS = re.compile(r"[?,&]")
 _CAN = re.compile(r"[a-z]*can[0-9]+")

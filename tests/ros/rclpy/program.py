@@ -20,6 +20,7 @@ from typing import Any
 import rclpy
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -150,7 +151,14 @@ class Peer:
     # topics
 
     def advertise(self, node: str, topic: str, type: str, qos: dict[str, Any] | None = None) -> None:
-        self.entities[f"{node} pub {topic}"] = self.nodes[node].create_publisher(interface(type), topic, _qos(qos))
+        """Publish a topic, and report how many subscribers it is connected to when that changes."""
+
+        def matched(info: Any) -> None:
+            emit({"matched": topic, "node": node, "count": info.current_count})
+
+        events = PublisherEventCallbacks(matched=matched)
+        publisher = self.nodes[node].create_publisher(interface(type), topic, _qos(qos), event_callbacks=events)
+        self.entities[f"{node} pub {topic}"] = publisher
 
     def publish(
         self, node: str, topic: str, value: dict[str, Any] | None = None, data: str = "", count: int = 1
@@ -159,6 +167,12 @@ class Peer:
         message = bytes.fromhex(data) if data else fill(publisher.msg_type(), value or {})
         for _ in range(count):
             publisher.publish(message)
+
+    def talk(self, node: str, topic: str, value: dict[str, Any], period: float = 0.1) -> None:
+        """Publish a message again and again: the first ones reach no subscriber that is still being connected."""
+        publisher = self.entities[f"{node} pub {topic}"]
+        message = fill(publisher.msg_type(), value)
+        self.nodes[node].create_timer(period, lambda: publisher.publish(message))
 
     def subscribe(
         self, node: str, topic: str, type: str, qos: dict[str, Any] | None = None, decode: bool = False
@@ -193,6 +207,13 @@ class Peer:
         publishers = asked.get_publishers_info_by_topic(topic)
         subscribers = asked.get_subscriptions_info_by_topic(topic)
         return {"publishers": [*map(_endpoint, publishers)], "subscribers": [*map(_endpoint, subscribers)]}
+
+    def topics_of(self, node: str, of: str) -> dict[str, Any]:
+        """What a node publishes and subscribes to, as `ros2 node info` lists it."""
+        asked, (namespace, _, name) = self.nodes[node], of.rpartition("/")
+        publishers = asked.get_publisher_names_and_types_by_node(name, namespace or "/")
+        subscribers = asked.get_subscriber_names_and_types_by_node(name, namespace or "/")
+        return {"publishers": dict(publishers), "subscribers": dict(subscribers)}
 
     # services and actions
 

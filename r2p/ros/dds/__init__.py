@@ -1,0 +1,80 @@
+"""DDS, the default network of ROS 2, as a transport: topics with programs that use Fast DDS or Cyclone DDS.
+
+In the order to read it:
+
+    names       names of topics and types in DDS, and what endpoints say of themselves in their user data
+    graph       the graph of other ROS nodes, from the endpoints and the names of nodes that DDS's discovery reports
+    cyclone     Cyclone DDS: a participant, its endpoints, which send and receive bytes, and the thread that waits
+    middleware  all of it for a ROS link
+
+Services, and what is made of them, are not offered over DDS: its implementations disagree about how a request and its
+answer belong together. Cyclone DDS is imported when a link is opened, not before.
+"""
+
+import os
+import socket
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from r2p.errors import TransportError
+from r2p.ros.link import RosTransport
+from r2p.ros.middleware import Middleware
+from r2p.ros.options import URL_OPTIONS, from_parsed
+from r2p.transports.url import Url
+
+if TYPE_CHECKING:
+    from r2p.transports.link import Hub
+
+DOMAIN_MAX = 232
+"""The highest domain whose ports exist."""
+
+
+def from_url(url: Url) -> RosTransport:
+    """`dds:[?domain=0&interface=lo]`. Raises TransportError.
+
+    Without these options, ROS_DOMAIN_ID and ROS_LOCALHOST_ONLY count, as for any program of ROS 2.
+    """
+    if url.address:
+        raise TransportError(f"{url}: DDS finds the others by itself: write dds:, or dds:?domain=3&interface=eth0")
+    parsed = url.parsed({**URL_OPTIONS, "domain": _domain, "interface": _interface})
+    options = from_parsed(parsed)
+    domain = parsed.get("domain", _domain_of_environment(os.environ))
+    interface = parsed.get("interface", _interface_of_environment(os.environ))
+    name = f"dds:?domain={domain}" if domain else "dds:"
+
+    def make(hub: "Hub") -> Middleware:
+        try:
+            from r2p.ros.dds.middleware import DdsMiddleware
+        except ImportError as error:
+            if (error.name or "").partition(".")[0] != "cyclonedds":
+                raise
+            raise TransportError("dds: cyclonedds is missing: pip install 'r2p[dds]'") from error
+        return DdsMiddleware(domain, interface, hub.space.clock)
+
+    return RosTransport(name, make, options)
+
+
+def _domain(text: str) -> int:
+    if not text.isdecimal() or int(text) > DOMAIN_MAX:
+        raise ValueError(f"a domain is a number from 0 to {DOMAIN_MAX}")
+    return int(text)
+
+
+def _interface(text: str) -> str:
+    names = [name for _, name in socket.if_nameindex()]
+    if text not in names:
+        raise ValueError(f"this computer has no such network interface; it has {', '.join(names)}")
+    return text
+
+
+def _domain_of_environment(environment: Mapping[str, str]) -> int:
+    text = environment.get("ROS_DOMAIN_ID") or "0"
+    try:
+        return _domain(text)
+    except ValueError as error:
+        raise TransportError(f"dds: ROS_DOMAIN_ID={text}: {error}") from error
+
+
+def _interface_of_environment(environment: Mapping[str, str]) -> str:
+    local = environment.get("ROS_LOCALHOST_ONLY") == "1"
+    return "lo" if local or environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST" else ""
