@@ -52,7 +52,7 @@ async def test_a_node_talks_with_nodes_of_rclpy(rclpy_peer: RclpyPeer) -> None:
         assert (reading.header.frame_id, reading.orientation.w) == ("base", 1.0)
         assert peer.ask("graph", node="listener")["nodes"] == ["/robot1/listener", "/talker"]
         assert peer.ask("topics_of", node="listener", of="/talker") == {
-            "publishers": {"/chatter": ["std_msgs/msg/String"]},
+            "publishers": {"/chatter": ["std_msgs/msg/String"], "/rosout": ["rcl_interfaces/msg/Log"]},
             "subscribers": {"/imu": ["sensor_msgs/msg/Imu"]},
         }
         (shown,) = peer.ask("endpoints", node="listener", topic="/chatter")["publishers"]
@@ -120,6 +120,6 @@ async def test_the_quality_of_service_is_that_of_ros(rclpy_peer: RclpyPeer) -> N
         await user.until(lambda: {each.node for each in user.graph.publishers if each.topic == "/map"} == {"/qos"})
         peer.ask("destroy", node="qos")
         await user.until(lambda: not any(each.topic == "/map" for each in user.graph.publishers))
-        assert any(each[:2] == ("publisher gone", "/map") for each in user.log)
+        await user.until(lambda: any(each[:2] == ("publisher gone", "/map") for each in user.log))
     assert (plan["transient_local"], plan["lifespan"], plan["reliable"]) == (True, 60 * SECOND, True)
     assert (pose["transient_local"], pose["deadline"]) == (False, 10**8)
