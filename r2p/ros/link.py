@@ -27,7 +27,7 @@ from r2p.names import LOG, SERVICE_SUFFIXES
 from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import TopicType
 from r2p.ros.cdr import cdr
-from r2p.ros.clock import ros_time
+from r2p.ros.clock import publishes_clock, ros_time
 from r2p.ros.discovery import RosDiscovery
 from r2p.ros.graph_names import GraphNames
 from r2p.ros.library import load_definitions
@@ -482,6 +482,8 @@ class RosTransport(Transport):
         link = RosLink(self._name, hub, middleware, self.options)
         hub.attach(link)
         try:
+            if publishes_clock(hub.space):
+                middleware.set_sim_time()
             async with ros_time(hub.space):
                 await middleware.run(link, opened)
         finally:

@@ -198,6 +198,9 @@ class Middleware(abc.ABC):
         Raises TransportError for a permanent fault.
         """
 
+    def set_sim_time(self) -> None:
+        """Let ROS nodes that start from now on follow `/clock`, as long as this runs, if the network can say that."""
+
     @abc.abstractmethod
     def add_node(self, node: str) -> None:
         """Show a ROS node. Its publishers, subscribers and servers come after it."""

@@ -71,6 +71,9 @@ class Ros1Middleware(Middleware):
             asked.cancel()
             await self._close()
 
+    def set_sim_time(self) -> None:
+        self._session.hold_parameter("/use_sim_time", True)
+
     # Nodes
 
     def add_node(self, node: str) -> None:

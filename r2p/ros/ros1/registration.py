@@ -37,7 +37,7 @@ _TAKEN: Final = "new node registered with same name"  # the master's words
 class _MasterEntry(NamedTuple):
     """A registration: `detail` is the type of a topic, or the URI of a service."""
 
-    kind: Literal["publisher", "subscriber", "service", "parameter"]
+    kind: Literal["publisher", "subscriber", "service", "parameter", "value"]
     node: str
     name: str
     detail: str
@@ -64,6 +64,8 @@ class MasterSession:
         self._nodes: dict[str, SlaveNode] = {}
         self._parameters: dict[tuple[str, str], None] = {}
         """The node and key of what is subscribed on the parameter server."""
+        self._held: dict[str, Value] = {}
+        """Parameters that are set for as long as the session lasts."""
         self._servers: dict[str, XmlRpcServer] = {}
         self._started: set[XmlRpcServer] = set()
         self._ended: list[XmlRpcServer] = []
@@ -141,6 +143,11 @@ class MasterSession:
     def unwatch_parameters(self, node: str, key: str) -> None:
         """Unsubscribe from parameters."""
         self._parameters.pop((node, key), None)
+        self._touch()
+
+    def hold_parameter(self, key: str, value: Value) -> None:
+        """Set a parameter on the server, also on one that has restarted, and delete it at the end."""
+        self._held[key] = value
         self._touch()
 
     def slave_uri(self, node: str) -> str:
@@ -227,7 +234,7 @@ class MasterSession:
             await server.close()
 
     def _wanted(self) -> dict[_MasterEntry, None]:
-        found: dict[_MasterEntry, None] = {}
+        found = {_MasterEntry("value", "/r2p", key, "", ""): None for key in self._held}
         for name, node in self._nodes.items():
             api = self.slave_uri(name)
             found.update((_MasterEntry("publisher", name, *each, api), None) for each in node.publications.items())
@@ -250,6 +257,8 @@ class MasterSession:
                     await self.master.register_service(node, name, detail, api)
                 case "parameter":
                     self.parameter_updated(node, name, await self.master.subscribe_param(node, api, name))
+                case "value":
+                    await self.master.set_param(node, name, self._held[name])
         except MasterError as error:
             self._refused.add(entry)
             self._notice(f"refused {kind} {name}", f"the ROS master refuses the {kind} {name} of {node}: {error}")
@@ -274,6 +283,8 @@ class MasterSession:
                 await self.master.unregister_service(node, name, detail)
             case "parameter":
                 await self.master.unsubscribe_param(node, api, name)
+            case "value":
+                await self.master.delete_param(node, name)
 
     # What the master knows
 
