@@ -55,10 +55,12 @@ async def count(goal: ServerGoal[Count.Goal, Count.Result, Count.Feedback]) -> C
 
 @asynccontextmanager
 async def module_and_client(kind: str) -> AsyncIterator[tuple[r2p.Module, r2p.Node]]:
-    """Yield a module for a server, and a node for its client: in it, or in another on a network of r2p or of ROS 2."""
+    """Yield a module for a server, and a node for its client: in it, or in another on a network of some kind."""
     network, bus = FakeRosNetwork(2), Network(loss=0.1 if kind == "lossy" else 0.0)
 
     def module(name: str) -> r2p.Module:
+        if kind == "can":
+            return r2p.Module(name, via="sim:actions")
         return r2p.Module(name, via=network.transport()) if kind == "ros2" else bus.module(name)
 
     async with module("A") as server:
@@ -80,7 +82,7 @@ async def two_nodes(kind: str) -> AsyncIterator[tuple[r2p.Node, r2p.Node]]:
 every_way = pytest.mark.parametrize("kind", ["module", "lossy", "ros2"])
 
 
-@every_way
+@pytest.mark.parametrize("kind", ["module", "lossy", "can", "ros2"])
 @pytest.mark.virtual_time
 async def test_goals(kind: str, caplog: pytest.LogCaptureFixture) -> None:
     async with two_nodes(kind) as (server_node, node):
