@@ -11,7 +11,7 @@ import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.management import CLASS_LATCHES, NO_PARAMS, QUEUE, ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.names import LOG, name_hash
+from r2p.names import name_hash
 from r2p.protocols.discovery.aliases import LinkNames
 from r2p.protocols.discovery.announcer import LocalTopic, Relayed
 from r2p.protocols.discovery.directory import FOR_EVER, TABLE_MAX, Demand, EndpointInfo, TopicInfo
@@ -31,6 +31,9 @@ from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.ros.graph_names import GraphNames
 from r2p.ros.middleware import RosGraph, RosPeerEndpoint
 from r2p.units import SECOND
+
+GATEWAYS = "/_r2p/gateways"
+"""The topic on which gateways find each other, which is not shown; ROS hides names with such an underscore as well."""
 
 TopicRole = tuple[str, int]
 """A topic, and ROLE_PUBLISHES or ROLE_SUBSCRIBES."""
@@ -94,7 +97,7 @@ class RosDiscovery(DiscoveryProtocol):
 
     def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
         self.own_nodes.setdefault((topic, role), {})[node] = publisher_class
-        self._dirty |= {topic: None, LOG: None}
+        self._dirty[topic] = None
         return []
 
     def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
@@ -102,7 +105,7 @@ class RosDiscovery(DiscoveryProtocol):
         nodes.pop(node, None)
         if not nodes:
             self.own_nodes.pop((topic, role), None)
-        self._dirty |= {topic: None, LOG: None}
+        self._dirty[topic] = None
         return []
 
     def touch(self, topic: str) -> None:
@@ -148,11 +151,6 @@ class RosDiscovery(DiscoveryProtocol):
         return []
 
     # What flows
-
-    @property
-    def nodes(self) -> set[str]:
-        """The nodes of this module that publish or subscribe to anything."""
-        return {node for nodes in self.own_nodes.values() for node in nodes if node}
 
     def publishes_latched(self, topic: str) -> bool:
         """Return whether a publisher of this module, or behind this gateway, latches the topic."""
@@ -261,6 +259,8 @@ class RosDiscovery(DiscoveryProtocol):
         return self._set_modules(now, graph)
 
     def _enter(self, now: int, role: int, endpoint: RosPeerEndpoint) -> None:
+        if endpoint.topic == GATEWAYS:
+            return
         topic = self._names.from_ros(endpoint.topic)
         if topic is None:
             is_new = endpoint.topic not in self._not_carried and len(self._not_carried) < TABLE_MAX

@@ -12,7 +12,6 @@ otherwise pass each message on for ever.
 """
 
 import asyncio
-import itertools
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Annotated, Any, ClassVar
 
@@ -28,7 +27,7 @@ from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import TopicType
 from r2p.ros.cdr import cdr
 from r2p.ros.clock import publishes_clock, ros_time
-from r2p.ros.discovery import RosDiscovery
+from r2p.ros.discovery import GATEWAYS, RosDiscovery
 from r2p.ros.graph_names import GraphNames
 from r2p.ros.library import load_definitions
 from r2p.ros.middleware import (
@@ -57,15 +56,13 @@ from r2p.transports.link import Hub, Transport, unique_name
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.url import open_transport
 
-GATEWAYS = "/_r2p/gateways"
-"""The topic on which gateways find each other; ROS's lists hide it, as its name begins with an underscore."""
-
 _GATEWAYS_KEY = GATEWAYS.encode()
 _GATEWAYS_QOS = Qos(depth=100)
 _OFF_ROS_AFTER_S = 3.0  # from when a topic is not on ROS until that is reported: its type may be on its way
 
 _UNKNOWN = "type unknown"
 _NOT_ON_ROS = "not on ROS"
+_NOTHING = TopicType(), TopicType()
 _ROLES = (ROLE_PUBLISHES, ROLE_SUBSCRIBES)
 
 
@@ -134,6 +131,8 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def _review_safely(self, topic: str) -> None:
         self.stats.lost.guard(self._review, topic)
+        if topic != LOG and self._log_node() != self._registrations.node_of(LOG):
+            self._ros.touch(LOG)
 
     def _review(self, topic: str) -> None:
         """Register a topic as it is now used, or remove it."""
@@ -177,7 +176,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         peers = self._ros.peers_of(topic)
         cls = self.class_of(topic, peers)
         if cls is None:
-            return None, _UNKNOWN
+            is_waiting = not peers and self._elsewhere(topic) == _NOTHING  # for a publisher: nothing is wrong yet
+            return None, "" if is_waiting else _UNKNOWN
         try:
             return self._types.find(topic, cls, {each.type for each in peers if each.type}), ""
         except MessageError as error:
@@ -185,9 +185,11 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def class_of(self, topic: str, peers: Sequence[RosPeerEndpoint] = ()) -> type[Message] | None:
         """Return the class of a topic that has these publishers and subscribers in other ROS nodes; None if unknown."""
-        hooks, nothing = self.gateway_hooks, (TopicType(), TopicType())
-        elsewhere = nothing if hooks is None else hooks.types_elsewhere(topic)
-        return self._classes.find(topic, elsewhere, peers)
+        return self._classes.find(topic, self._elsewhere(topic), peers)
+
+    def _elsewhere(self, topic: str) -> tuple[TopicType, TopicType]:
+        """Return the types in which a topic is published, and subscribed, on a gateway's other links."""
+        return _NOTHING if self.gateway_hooks is None else self.gateway_hooks.types_elsewhere(topic)
 
     def _learn_type(self, topic: str) -> None:
         """Find out the type of a topic that ROS nodes have, and this side does not, or does not know."""
@@ -239,11 +241,10 @@ class RosLink(BufferedLink, MiddlewareUser):
         )
 
     def _nodes(self, topic: str, role: int) -> dict[tuple[str, str], str]:
-        """Return the ROS nodes that have a topic, by module and node."""
+        """Return the ROS nodes that have a topic, by module and node; none: the module itself has it."""
+        if topic == LOG:
+            return {("", LOG): self._log_node()}
         own = self._ros.own_nodes.get((topic, role), {})
-        if topic == LOG:  # of all nodes of the module: one of them publishes it
-            free = (each for each in sorted(self._ros.nodes - {LOG}) if not self._is_refused(each))
-            own = dict.fromkeys(itertools.islice(free, 1), 0)
         found = {("", node): self.names.node(node) for node in own if node}
         if self.options.ros_nodes:
             for module, node in self._ros.relayed_nodes.get((topic, role), {}):
@@ -251,8 +252,11 @@ class RosLink(BufferedLink, MiddlewareUser):
                     found[module, node] = self.names.node(module, node)
         return found
 
-    def _is_refused(self, node: str) -> bool:
-        return self.names.node(node) in self._registrations.refused
+    def _log_node(self) -> str:
+        """Return the ROS node that publishes the log, which is that of all nodes of the module."""
+        if self._ros.is_gateway:
+            return self._registrations.module_node
+        return next(iter(self._registrations.nodes_besides(LOG)), self._registrations.module_node)
 
     # What is reported
 
@@ -451,7 +455,6 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def shut_down(self, node: str, reason: str) -> None:
         self._registrations.forget_node(node)
-        self._touch(LOG)
         self.notice("ROS node ended", f"{node} is no longer a ROS node here: {reason}", trouble=True)
 
 

@@ -81,6 +81,15 @@ class Registrations:
         """Return the endpoints of a topic in a role."""
         return [each for each in self._endpoints.get((name, role), ()) if isinstance(each, RosEndpoint)]
 
+    def node_of(self, name: str) -> str:
+        """Return a node that publishes a topic; empty without one."""
+        return next((each.node for each in self._endpoints.get((name, ROLE_PUBLISHES), ())), "")
+
+    def nodes_besides(self, name: str) -> list[str]:
+        """Return the nodes that have anything but this topic, in order."""
+        shares = Counter(each.node for role in self._methods for each in self._endpoints.get((name, role), ()))
+        return sorted(node for node, count in self._counts.items() if count > shares[node])
+
     def forget_node(self, node: str) -> None:
         """Remove a node for good: another one has its name."""
         self.refused.add(node)

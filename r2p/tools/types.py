@@ -36,7 +36,7 @@ def load_type(text: str, others: Iterable[type[r2p.Message]] = ()) -> type[r2p.M
     """Return the message class of `package.module:Class`, `FILE.py:Class`, or a name of a type. Raises UsageError.
 
     A name is one in r2p.msg (`LaserScan`), or the full one (`sensor_msgs/LaserScan`, also as ROS 2 writes it, with
-    `/msg/`) of a class there or of `others`.
+    `/msg/`) of a class there or of `others`, or of a type that comes with ROS (extra `ros`).
     """
     if "/" in text and ":" not in text:
         return _by_full_name(text, [*standard_types(), *others])
@@ -53,12 +53,22 @@ def load_type(text: str, others: Iterable[type[r2p.Message]] = ()) -> type[r2p.M
 
 def _by_full_name(text: str, known: list[type[r2p.Message]]) -> type[r2p.Message]:
     by_name = {r2p.layout(cls).name: cls for cls in reversed(known)}
-    found = by_name.get(text.replace("/msg/", "/"))
+    found = by_name.get(text.replace("/msg/", "/")) or _of_ros(text)
     if found is None:
         close = difflib.get_close_matches(text, by_name, n=1)
         advice = f"did you mean {close[0]}?" if close else "write package.module:Class or FILE.py:Class"
         raise UsageError(f"neither r2p.msg nor [types] of r2p.toml has a type {text}; {advice}")
     return found
+
+
+def _of_ros(text: str) -> type[r2p.Message] | None:
+    """Return the class of a type that comes with ROS 2, or else with ROS 1; None without one, or without rosbags."""
+    from r2p.ros.topics import ros_class  # only here: it takes a tenth of a second
+
+    for version in (2, 1):
+        with contextlib.suppress(r2p.MessageError):
+            return ros_class(text, version)
+    return None
 
 
 def load_service(name: str, text: str) -> Definition[Any, Any]:

@@ -9,7 +9,7 @@ import r2p
 from r2p import BridgeOptions, Module
 from r2p.messages import layout
 from r2p.msg import Float32, Pose3, String, Velocity3
-from r2p.ros.link import GATEWAYS
+from r2p.ros.discovery import GATEWAYS
 from r2p.ros.topics import ros_class
 from r2p.testing.network import Network, node_in
 from tests.ros.fake import FakeRosNetwork
