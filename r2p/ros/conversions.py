@@ -70,12 +70,18 @@ def conversion(ours: type[Message], theirs: str, version: int, names: RosNames =
     found = next((pair for pair in _pairs_of(ours) if pair.theirs(version) == theirs), None)
     if found is None:
         return None
-    types = RosTypes(version, definitions_of_ros(theirs, version))
-    made = types.load(theirs)
+    types, made = _classes(theirs, version)
     to_ros, from_ros = found.make(RosParts(found.ours, types, made, version, names))
     if ours is not found.ours:
         from_ros = _into(ours, from_ros)
     return Conversion(ours, made, to_ros, from_ros, found.lost_to_ros, found.lost_from_ros)
+
+
+@functools.lru_cache(maxsize=256)
+def _classes(theirs: str, version: int) -> tuple[RosTypes, type[Message]]:
+    """Return the class of a ROS type, made once for all topics, and with it those of the types in it."""
+    types = RosTypes(version, definitions_of_ros(theirs, version))
+    return types, types.load(theirs)
 
 
 def standard_type(ours: type[Message], version: int) -> str | None:

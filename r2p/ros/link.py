@@ -12,6 +12,7 @@ otherwise pass each message on for ever.
 """
 
 import asyncio
+import functools
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Annotated, Any, ClassVar
 
@@ -25,6 +26,7 @@ from r2p.messages import SIZE_MAX, Len, Message, layout
 from r2p.names import LOG, SERVICE_SUFFIXES
 from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import TopicType
+from r2p.ros.background import BackgroundResults
 from r2p.ros.cdr import cdr
 from r2p.ros.clock import publishes_clock, ros_time
 from r2p.ros.discovery import GATEWAYS, RosDiscovery
@@ -103,7 +105,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.off_ros: dict[str, str] = {}
         """The topics that are not on the ROS network, and why."""
         self._types = TopicTypes(middleware.version, options, hub.space.module, self.stats.lost)
-        self._classes = TopicClasses(hub.space, self._types, hub.message_type, middleware.describe, self._touch)
+        self._background = BackgroundResults(hub.space.loop, self._touch)
+        self._classes = TopicClasses(hub, self._types, self._background, middleware.describe, self._touch)
         self._registrations = Registrations(middleware, self.names.node(hub.space.module))
         self.services = RosServices(self, hub, self._ros, self._registrations)
         self._published: dict[str, _Published] = {}
@@ -178,8 +181,10 @@ class RosLink(BufferedLink, MiddlewareUser):
         if cls is None:
             is_waiting = not peers and self._elsewhere(topic) == _NOTHING  # for a publisher: nothing is wrong yet
             return None, "" if is_waiting else _UNKNOWN
+        types = frozenset(each.type for each in peers if each.type)
         try:
-            return self._types.find(topic, cls, {each.type for each in peers if each.type}), ""
+            find = functools.partial(self._types.find, topic, cls, types)
+            return self._background.get(topic, (topic, cls, types), find), ""
         except MessageError as error:
             return None, str(error)
 
@@ -390,6 +395,7 @@ class RosLink(BufferedLink, MiddlewareUser):
     def close(self) -> None:
         self.services.close()
         self._classes.close()
+        self._background.close()
         super().close()
 
     # For the middleware

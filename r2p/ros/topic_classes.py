@@ -14,16 +14,15 @@ from r2p.errors import MessageError
 from r2p.messages import Message, layout
 from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import TopicType
+from r2p.ros.background import BackgroundResults
 from r2p.ros.classes import standard_classes
 from r2p.ros.middleware import RosPeerEndpoint
 from r2p.ros.topics import TopicTypes, ros_class, ros_type
-from r2p.runtime.topic import TopicSpace
+from r2p.transports.link import Hub
 
 _TRY_AGAIN_S = 5.0
 """Seconds after which modules are asked once more for a type that none of them gave."""
 
-AskModules = Callable[[bytes, str], Awaitable[type[Message] | None]]
-"""Asks other modules for the class with this fingerprint of this topic."""
 AskRosNode = Callable[[RosPeerEndpoint], Awaitable[str]]
 """Asks a ROS node for the definition of its type."""
 
@@ -33,15 +32,16 @@ class TopicClasses:
 
     def __init__(
         self,
-        space: TopicSpace,
+        hub: Hub,
         types: TopicTypes,
-        ask_modules: AskModules,
+        background: BackgroundResults,
         ask_ros_node: AskRosNode,
         changed: Callable[[str], None],
     ) -> None:
-        self._space = space
+        self._space = hub.space
         self._types = types
-        self._ask_modules = ask_modules
+        self._background = background
+        self._ask_modules = hub.message_type
         self._ask_ros_node = ask_ros_node
         self._changed = changed
         self._known: dict[str, type[Message]] = {}
@@ -133,14 +133,21 @@ class TopicClasses:
     def _of_peer(self, topic: str, peer: RosPeerEndpoint) -> type[Message] | None:
         given = self._definitions.get((peer.type, peer.checksum), "")
         try:
-            found = ros_class(peer.type, self._types.version, given)
-            if given or not peer.checksum or ros_type(found, self._types.version).checksum == peer.checksum:
-                return found
+            key = peer.type, peer.checksum, given
+            found = self._background.get(topic, key, lambda: self._make(peer.type, peer.checksum, given))
         except MessageError:
-            if given:
-                return None
-        self._start((peer.type, peer.checksum), self._describe, topic, peer)
-        return None
+            if not given:
+                self._start((peer.type, peer.checksum), self._describe, topic, peer)
+            return None
+        return found
+
+    def _make(self, type_name: str, checksum: str, definition: str) -> type[Message]:
+        """Return the class of a ROS node's type; without its definition, of that which comes with ROS."""
+        made = ros_class(type_name, self._types.version, definition)
+        layout(made)
+        if not definition and checksum not in ("", ros_type(made, self._types.version).checksum):
+            raise MessageError(f"{type_name} has another definition here")
+        return made
 
     async def _describe(self, topic: str, peer: RosPeerEndpoint) -> None:
         definition = await self._ask_ros_node(peer)

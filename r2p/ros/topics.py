@@ -7,7 +7,7 @@ everything else is a type of its own, as `r2p msg export` writes it.
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import msgspec
@@ -90,7 +90,7 @@ class TopicTypes:
         found = lookup(self._options.types, topic)
         return found if isinstance(found, type) and issubclass(found, Message) else None
 
-    def find(self, topic: str, cls: type[Message], peers: set[str]) -> RosTopic:
+    def find(self, topic: str, cls: type[Message], peers: Collection[str]) -> RosTopic:
         """Return how a topic of this class travels. `peers` are the types that ROS nodes have for it, by name.
 
         Without an option for the topic it is the usual type of the class, unless all peers have another one that the
