@@ -30,7 +30,7 @@ class Count(r2p.Message):
     seconds: r2p.f64 = 0.0
 
 
-def _route(pipe: Connection) -> None:
+def route(pipe: Connection) -> None:
     """zenohd's own code, in the library."""
     config = zenoh.Config()
     config.insert_json5("mode", '"router"')
@@ -165,7 +165,7 @@ def _measure(port: int, via: str) -> Measured:
 
 
 def rows() -> Iterator[Row]:
-    with process(_route) as router:
+    with process(route) as router:
         port = router.recv()
         pairs = [(_measure(port, ROS), _measure(port, OURS)) for _ in range(RUNS)]
     # The run in the middle: on two cores, much depends on which of three processes runs when.
