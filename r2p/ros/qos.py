@@ -1,15 +1,7 @@
 """The quality of service of this side's publishers and subscribers on a ROS network.
 
-| r2p | ROS |
-| --- | --- |
-| `latch=True` | transient local, depth 1: in ROS 1 latching |
-| a publisher's class | reliable; `Periodic`: deadline, its period; `Sporadic` that drops what is late: lifespan |
-| `queue=N` | depth N |
-| `lossy=True` | best effort; so are subscribers of a topic that any ROS node publishes as best effort |
-| a subscriber of a topic that all ROS nodes latch | transient local |
-| the topic `log`, `/rosout` there | as all ROS nodes: transient local, depth 1000, lifespan 10 s |
-
-`--qos` changes each of these.
+docs/how-to/ros2.md has the table. A publisher offers what fits most subscribers, and a subscriber asks for no more than
+the ROS nodes offer that publish now; `QosChange` changes each of that.
 """
 
 from collections.abc import Sequence
