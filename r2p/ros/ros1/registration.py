@@ -289,11 +289,12 @@ class MasterSession:
     # What the master knows
 
     async def _look(self) -> None:
+        before = frozenset(self._nodes)  # one may end meanwhile, and is still in the answer
         state = await self.master.get_system_state(self._name())
         types = await self.master.get_topic_types(self._name())
         for entry in [each for each in self._registered if not _is_known(each, state)]:
             await self._find_lost(entry, state)
-        graph = _graph_of(state, types, frozenset(self._nodes))
+        graph = _graph_of(state, types, before | self._nodes.keys())
         if graph != self._graph and self._user is not None:
             self._graph = graph
             self._user.graph_changed(graph)
