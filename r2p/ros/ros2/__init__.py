@@ -31,6 +31,6 @@ def from_url(url: Url) -> RosTransport:
             if missing not in ("zenoh", "xxhash"):
                 raise
             raise options.error(f"{missing} is missing: pip install 'r2p[ros]'") from error
-        return Ros2Middleware(options, hub.space.clock, hub.random)
+        return Ros2Middleware(options, hub.space.clock, hub.random, observer=hub.observer)
 
     return RosTransport(options.name, make, options.ros)

@@ -15,8 +15,7 @@ from r2p.transports.zenoh.link import TokenDebouncer
 _GRAPH_S = 0.02  # seconds in which changes of the graph are reported as one
 _REACH_S = 0.01  # seconds until the next check whether messages reach a subscriber whose token is there
 _REACH_TRIES = 100
-_ALONE_S = 3.0  # seconds without any node until other domains are looked at
-_ALONE_MAX_S = 60.0  # twice as long each further time, and at most
+_ALONE_MAX_S = 60.0  # seconds between two looks at other domains: twice as long each time, and at most
 _TOKENS_TIMEOUT_S = 2.0  # seconds for the network to answer with all its tokens
 _EXPLAINED_MAX = 64  # differences between endpoints that are explained
 _NAMED_MAX = 8  # domains that one text names
@@ -75,9 +74,8 @@ class RmwMatches:
         if own.kind == EntityKind.PUBLISHER and not self._own(own.kind, own.name):
             self._joined.discard(own.name)
 
-    async def look_for_other_domains(self) -> None:
-        """If no ROS node is found, report once on which other domains there are some."""
-        pause = _ALONE_S
+    async def look_for_other_domains(self, pause: float) -> None:
+        """If no ROS node is found in `pause` seconds, report once on which other domains there are some."""
         while not self._session.graph:
             await asyncio.sleep(pause)
             pause = min(2 * pause, _ALONE_MAX_S)

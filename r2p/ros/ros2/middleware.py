@@ -20,7 +20,7 @@ from r2p.ros.ros2.topics import RmwPublisher, RmwSubscription
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh.config import connection_settings
-from r2p.transports.zenoh.diagnose import NOTHING_LISTENS, diagnose_connection, find_wrong_server
+from r2p.transports.zenoh.diagnose import NOT_ADMITTED, NOTHING_LISTENS, diagnose_connection, find_wrong_server
 from r2p.transports.zenoh.session import Unreachable, ZenohSession, open_session
 
 if TYPE_CHECKING:
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     import zenoh
 
 _BACKOFF_MAX_S = 0.5  # seconds between two attempts to open a session
+_ALONE_S = 3.0  # seconds without any ROS node until other domains are looked at
+_ALONE_TOOL_S = 0.3  # the same for a tool
 _DIAGNOSE_EVERY_S = 1.0  # seconds between two checks whether a session that is down should be explained
 
 _START_ROUTER = "start it with `ros2 run rmw_zenoh_cpp rmw_zenohd`; any zenoh 1 router will do"
@@ -40,11 +42,13 @@ class Ros2Middleware(Middleware):
     version = 2
     lost: LoggedCounter
 
-    def __init__(self, options: Ros2Options, clock: Clock, random: random.Random) -> None:
+    def __init__(self, options: Ros2Options, clock: Clock, random: random.Random, *, observer: bool = False) -> None:
+        """`observer`: for a tool, whose user waits."""
         self.lost = LoggedCounter(options.name, clock)
         self._options = options
         self._clock = clock
         self._random = random
+        self._alone_after = _ALONE_TOOL_S if observer else _ALONE_S
         self._user: MiddlewareUser | None = None
         self._session: RmwSession | None = None
         self._matches: RmwMatches | None = None
@@ -95,13 +99,17 @@ class Ros2Middleware(Middleware):
         """Report the reason whenever the session is down, and once where ROS nodes are if there are none here."""
         assert self._matches is not None
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._matches.look_for_other_domains())
+            tasks.create_task(self._matches.look_for_other_domains(self._alone_after))
+            reason = ""
             while True:
                 await asyncio.sleep(_DIAGNOSE_EVERY_S)
                 if self._up:
                     continue
-                reason = await self._diagnose(config)
-                if not self._up:
+                before, reason = reason, await self._diagnose(config)
+                may_try_again = (
+                    NOT_ADMITTED in reason and reason != before
+                )  # as zenoh does soon after a router's return
+                if not self._up and not may_try_again:
                     user.middleware_waits(reason)
 
     def _start(self, zenoh_session: ZenohSession, user: MiddlewareUser) -> None:

@@ -50,7 +50,7 @@ async def test_two_programs() -> None:
 
 async def test_domains(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nodes on another domain are not there; where they are is said."""
-    monkeypatch.setattr("r2p.ros.ros2.matches._ALONE_S", 0.2)
+    monkeypatch.setattr("r2p.ros.ros2.middleware._ALONE_S", 0.2)
     async with (
         asyncio.timeout(GUARD),
         router() as network,
