@@ -103,7 +103,7 @@ class Ros2Middleware(Middleware):
             reason = ""
             while True:
                 await asyncio.sleep(_DIAGNOSE_EVERY_S)
-                if self._up:
+                if self._is_up():
                     continue
                 before, reason = reason, await self._diagnose(config)
                 may_try_again = (
@@ -153,6 +153,9 @@ class Ros2Middleware(Middleware):
         self._transports.discard(other)
         if not self._transports and self._options.zenoh.mode != "peer":
             self._on_down("the connection is lost")
+
+    def _is_up(self) -> bool:
+        return self._up
 
     def _on_up(self) -> None:
         if not self._up and self._user is not None and self._matches is not None:
