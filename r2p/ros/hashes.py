@@ -28,6 +28,7 @@ _IDS = {
     "string": 17,
     "wstring": 18,
 }
+_NAMES = {number: name for name, number in _IDS.items() if name != "char"}
 _NESTED = 1
 _BOUNDED_TEXT = 4  # more than the id without a bound
 _ARRAY, _BOUNDED_SEQUENCE, _SEQUENCE = 48, 96, 144  # more than the id of the element
@@ -93,14 +94,20 @@ class TypeDescriptions:
 
     def hash(self, name: str) -> str:
         """Return the hash of a type, "RIHS01_" and 64 hexadecimal digits. Raises MessageError for a missing type."""
+        return f"RIHS01_{hashlib.sha256(json.dumps(self.description(name)).encode()).hexdigest()}"
+
+    def description(self, name: str) -> dict[str, Any]:
+        """Return the description of a type, and of all types in it, whose JSON the hash is made of.
+
+        Raises MessageError for a missing type.
+        """
         name = full_name(name)
         nested: set[str] = set()
         self._collect(name, (), nested)
-        description = {
+        return {
             "type_description": self._describe(name),
             "referenced_type_descriptions": [self._describe(each) for each in sorted(nested)],
         }
-        return f"RIHS01_{hashlib.sha256(json.dumps(description).encode()).hexdigest()}"
 
     def _collect(self, name: str, outer: tuple[str, ...], nested: set[str]) -> None:
         """Add the names of all types in a type."""
@@ -147,3 +154,14 @@ def _describe_type(kind: FieldType) -> dict[str, Any]:
         "string_capacity": kind.text_max,
         "nested_type_name": nested,
     }
+
+
+def field_type(number: int, capacity: int, text_max: int, nested: str) -> FieldType:
+    """Return the type of a field of these parts of a description. Raises MessageError if r2p has none such."""
+    element, kind = number % _ARRAY, number - number % _ARRAY
+    bounded_text = element - _BOUNDED_TEXT in (_IDS["string"], _IDS["wstring"])
+    base = _NAMES.get(element - _BOUNDED_TEXT if bounded_text else element, nested if element == _NESTED else "")
+    if not base or kind not in (0, _ARRAY, _BOUNDED_SEQUENCE, _SEQUENCE):
+        raise MessageError(f"type {number} of a field is not known here")
+    count = None if not kind else 0 if kind == _SEQUENCE else capacity
+    return FieldType(base, text_max if bounded_text else 0, count, kind == _BOUNDED_SEQUENCE)

@@ -26,6 +26,7 @@ from r2p.messages import SIZE_MAX, Len, Message, layout
 from r2p.names import LOG, SERVICE_SUFFIXES
 from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import TopicType
+from r2p.ros import type_descriptions
 from r2p.ros.background import BackgroundResults
 from r2p.ros.cdr import cdr
 from r2p.ros.clock import publishes_clock, ros_time
@@ -106,7 +107,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         """The topics that are not on the ROS network, and why."""
         self._types = TopicTypes(middleware.version, options, hub.space.module, self.stats.lost)
         self._background = BackgroundResults(hub.space.loop, self._touch)
-        self._classes = TopicClasses(hub, self._types, self._background, middleware.describe, self._touch)
+        self._classes = TopicClasses(hub, self._types, self._background, self._describe, self._touch)
         self._registrations = Registrations(middleware, self.names.node(hub.space.module))
         self.services = RosServices(self, hub, self._ros, self._registrations)
         self._published: dict[str, _Published] = {}
@@ -286,6 +287,13 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def not_carried(self) -> dict[str, str]:
         return self.off_ros | self.services.off_ros
+
+    async def _describe(self, peer: RosPeerEndpoint) -> str:
+        """Return the definition of another node's type: of the middleware, else of the node itself."""
+        found, middleware = await self.middleware.describe(peer), self.middleware
+        if found or middleware.version == 1 or not middleware.has_services or not self._registrations.nodes:
+            return found
+        return await type_descriptions.ask(middleware, min(self._registrations.nodes), peer)
 
     def known_types(self) -> Iterable[type[Message]]:
         return self._classes.known
