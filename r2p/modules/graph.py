@@ -4,9 +4,10 @@ r2p modules announce all of it at once. Firmware announces its name and its topi
 not the nodes that they belong to. The `age` of a view says how old the knowledge is.
 """
 
+import asyncio
 import contextlib
 import functools
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import msgspec
@@ -224,6 +225,17 @@ class NetworkView:
         """
         check_seconds("the period of watch_parameters()", period, least=0.001)
         return parameter_services.watch(self._asker(module), lambda: self._instance_of(module), module, period)
+
+    def follow_parameters(
+        self, module: str, *, period: float = 0.5, pause: Callable[[float], Awaitable[object]] = asyncio.sleep
+    ) -> AsyncIterator[dict[tuple[str, str], ParameterInfo]]:
+        """Iterate over all parameters of a module by (node, name): as they are now, and after each change.
+
+        The module is asked as by `watch_parameters`; `pause` waits between two questions. Raises when iterated, Error
+        if there is no such module, and TimeoutError if it does not answer at the beginning.
+        """
+        instance = functools.partial(self._instance_of, module)
+        return parameter_services.follow(self._asker(module), instance, module, period, pause)
 
     def _asker(self, module: str) -> parameter_services.Ask:
         firmware = "its parameters are bytes in its flash, see `r2p param --help`"

@@ -354,16 +354,22 @@ class OwnServices:
         """
         if not call.changes:
             return ""
-        module, scheme = self._space.module, scheme_of(link.name)
-        if self.relay is not None and self.relay.is_read_only(link):
-            return f"{module} refuses changes from {scheme}: it is started with --read-only for that link"
-        if link.guard is not None:
-            return ""
-        if call.operation in self._needs_key:
+        if link.guard is None and call.operation in self._needs_key and not self._is_read_only(link):
+            module, scheme = self._space.module, scheme_of(link.name)
             return f"{module} takes this only from links with a key, and its {scheme} has none (?key=FILE)"
-        if self._allow_control or not is_ip(link.name):
+        return self.change_refusal(link)
+
+    def change_refusal(self, link: Link) -> str:
+        """Return why what comes by this link may not change anything; empty if it may."""
+        module, scheme = self._space.module, scheme_of(link.name)
+        if self._is_read_only(link):
+            return f"{module} refuses changes from {scheme}: it is started with --read-only for that link"
+        if link.guard is not None or self._allow_control or not is_ip(link.name):
             return ""
         return permission_text(module, scheme)
+
+    def _is_read_only(self, link: Link) -> bool:
+        return self.relay is not None and self.relay.is_read_only(link)
 
     def _refuse(self, link: Link, call: OwnCall, refusal: str) -> bytes:
         """Count a request that lacks permission, log it once in a while, and return its answer."""

@@ -209,16 +209,34 @@ async def reset(ask: Ask, module: str, node: str | None, names: Iterable[str] | 
 async def watch(
     ask: Ask, instance: Callable[[], int | None], module: str, period: float
 ) -> AsyncIterator[ParameterInfo]:
-    """Yield the parameters of a module that change, each as it is then; `instance` is that of the module now.
+    """Yield the parameters of a module that change, each as it is then. `follow` says more."""
+    before: dict[Name, ParameterInfo] | None = None
+    async for known in follow(ask, instance, module, period):
+        if before is not None:
+            for name, each in known.items():
+                if before.get(name) != each:
+                    yield each
+        before = known
+
+
+async def follow(
+    ask: Ask,
+    instance: Callable[[], int | None],
+    module: str,
+    period: float,
+    pause: Callable[[float], Awaitable[object]] = asyncio.sleep,
+) -> AsyncIterator[dict[Name, ParameterInfo]]:
+    """Yield all parameters of a module, at the beginning and after each change; `instance` is that of the module now.
 
     Where the module does not answer, it is asked again; one that has restarted is asked for all of its parameters.
     """
     asked = instance()
     listed = _decoded(module, await _asked(ask, Operation.PARAMETERS, b""))
-    known = {(each.node, each.name): each for each in _infos(module, listed)}
+    known = _by_name(module, listed)
+    yield known
     silent = False
     while True:
-        await asyncio.sleep(period)
+        await pause(period)
         now = instance()
         restarted = now != asked
         operation = Operation.PARAMETERS if restarted else Operation.PARAMETER_CHANGES
@@ -230,12 +248,15 @@ async def watch(
             silent = True
             continue
         silent, asked = False, now
-        infos = _infos(module, listed)
-        fresh = {(each.node, each.name): each for each in infos}
-        changed = [each for name, each in fresh.items() if known.get(name) != each]
-        known = fresh if listed.whole else known | fresh
-        for each in changed:
-            yield each
+        fresh = _by_name(module, listed)
+        fresh = fresh if listed.whole else known | fresh
+        if fresh != known:
+            known = fresh
+            yield known
+
+
+def _by_name(module: str, listed: ParameterList) -> dict[Name, ParameterInfo]:
+    return {(each.node, each.name): each for each in _infos(module, listed)}
 
 
 async def _asked(ask: Ask, operation: Operation, argument: bytes) -> bytes:

@@ -40,6 +40,8 @@ GROUP = "r2p.transports"
 
 _IP = frozenset({"dds", "ros1", "ros2", "tcp", "tcp-listen", "zenoh"})
 
+_KEYLESS = frozenset({"ros1", "ros2", "dds"})
+
 _OPTIONS = re.compile(r"[?,&]")
 _CAN = re.compile(r"[a-z]*can[0-9]+")
 _CLOSE = 0.65  # how alike a name must be to be suggested (difflib): can and rtcan are 0.75
@@ -115,6 +117,11 @@ def scheme_of(link: str) -> str:
 def is_ip(link: str) -> bool:
     """Return whether any computer of an IP network may reach a link (by name): REBOOT and changes need permission."""
     return scheme_of(link) in _IP
+
+
+def takes_key(scheme: str) -> bool:
+    """Return whether links of this scheme can have a key; nodes of ROS know none."""
+    return scheme not in _KEYLESS
 
 
 def key_file(text: str) -> SharedKey:

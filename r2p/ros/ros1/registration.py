@@ -34,6 +34,10 @@ _GONE = (OSError, XmlRpcError)  # what calls of a master raise that can't be rea
 _TAKEN: Final = "new node registered with same name"  # the master's words
 
 
+OnParameter = Callable[[str, Value], object]
+"""Called with a key and its value, None: it is not set. For a namespace the value is a dict, of other keys below it."""
+
+
 class _MasterEntry(NamedTuple):
     """A registration: `detail` is the type of a topic, or the URI of a service."""
 
@@ -48,7 +52,7 @@ class MasterSession:
     """Keeps nodes, their topics and services registered, and reports the graph; each node has a slave server.
 
     Everything can be declared before `run` and while the master is gone. It calls `middleware_up`, `middleware_waits`,
-    `graph_changed`, `parameter_changed`, `notice` and `shut_down` of the MiddlewareUser itself.
+    `graph_changed`, `notice` and `shut_down` of the MiddlewareUser itself.
     """
 
     def __init__(self, address: RosAddress, slaves: SlaveUser, lost: Counter[str]) -> None:
@@ -62,8 +66,8 @@ class MasterSession:
         """The host by which others reach this computer, as far as that is known."""
         self._user: MiddlewareUser | None = None
         self._nodes: dict[str, SlaveNode] = {}
-        self._parameters: dict[tuple[str, str], None] = {}
-        """The node and key of what is subscribed on the parameter server."""
+        self._parameters: dict[str, OnParameter] = {}
+        """What is subscribed on the parameter server, by key: a parameter or a namespace."""
         self._held: dict[str, Value] = {}
         """Parameters that are set for as long as the session lasts."""
         self._servers: dict[str, XmlRpcServer] = {}
@@ -99,7 +103,6 @@ class MasterSession:
         """Unregister everything that a node still has, and end its slave server."""
         if self._nodes.pop(node, None) is not None:
             self._ended.append(self._servers.pop(node))
-            self._parameters = {name: None for name in self._parameters if name[0] != node}
             self._touch()
 
     def advertise(self, node: str, topic: str, type_name: str) -> None:
@@ -135,14 +138,19 @@ class MasterSession:
             self._nodes[node].services.pop(service, None)
             self._touch()
 
-    def watch_parameters(self, node: str, key: str) -> None:
-        """Subscribe to a parameter, or to those in a namespace: `parameter_changed` follows, also with what is set."""
-        self._parameters[node, key] = None
+    def watch_parameters(self, key: str, on_parameter: OnParameter) -> None:
+        """Subscribe to a parameter, or to those in a namespace, as one of the nodes; if that is done already, again.
+
+        It begins with what is set, also after a restart of the master.
+        """
+        for entry in [each for each in self._registered if each.kind == "parameter" and each.name == key]:
+            del self._registered[entry]
+        self._parameters[key] = on_parameter
         self._touch()
 
-    def unwatch_parameters(self, node: str, key: str) -> None:
+    def unwatch_parameters(self, key: str) -> None:
         """Unsubscribe from parameters."""
-        self._parameters.pop((node, key), None)
+        self._parameters.pop(key, None)
         self._touch()
 
     def hold_parameter(self, key: str, value: Value) -> None:
@@ -241,8 +249,9 @@ class MasterSession:
             found.update((_MasterEntry("subscriber", name, *each, api), None) for each in node.subscriptions.items())
             for service, port in node.services.items():
                 found[_MasterEntry("service", name, service, uri_of("rosrpc", self.host, port), api)] = None
-        for name, key in self._parameters:
-            found[_MasterEntry("parameter", name, key, "", self.slave_uri(name))] = None
+        for name in [*self._nodes][:1]:
+            api = self.slave_uri(name)
+            found.update((_MasterEntry("parameter", name, key, "", api), None) for key in self._parameters)
         return found
 
     async def _register(self, entry: _MasterEntry) -> None:
@@ -336,11 +345,10 @@ class MasterSession:
 
     def parameter_updated(self, node: str, key: str, value: Value) -> bool:
         """Note the value of a parameter; return whether it was subscribed."""
-        if not any(each == node and _contains(subscribed, key) for each, subscribed in self._parameters):
-            return False
-        if self._user is not None:
-            self._user.parameter_changed(key, None if value == {} else value)
-        return True
+        watching = [call for subscribed, call in self._parameters.items() if _contains(subscribed, key)]
+        for on_parameter in watching:
+            on_parameter(key, None if value == {} else value)
+        return bool(watching)
 
     def shutdown_asked(self, node: str, caller: str, reason: str) -> None:
         """End a node: its name was taken, or a user wants it."""

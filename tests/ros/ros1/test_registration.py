@@ -127,7 +127,7 @@ async def test_rosnode_kill(ros1: Ros1, master: MasterClient) -> None:
 async def test_a_master_that_dies_and_returns(own_ros1: Ros1) -> None:
     async with running(own_ros1.uri, "/one") as (session, recorder):
         session.advertise("/one", "/spin", STRING)
-        session.watch_parameters("/one", "/one")
+        session.watch_parameters("/one", recorder.parameter_changed)
         await recorder.event("up")
         own_ros1.close()
         _, text, trouble = await recorder.event("notice")
@@ -191,7 +191,7 @@ async def test_what_the_master_refuses_is_said(ros1: Ros1) -> None:
 async def test_parameters_that_are_watched(ros1: Ros1, master: MasterClient) -> None:
     await master.set_param("/test", "/one/kp", 1.0)
     async with running(ros1.uri, "/one") as (session, recorder):
-        session.watch_parameters("/one", "/one")
+        session.watch_parameters("/one", recorder.parameter_changed)
         assert await recorder.event("parameter") == ("parameter", "/one", {"kp": 1.0})
         assert (await ros1.run("rosparam", "set", "/one/kp", "0.7")).code == 0
         assert await recorder.event("parameter") == ("parameter", "/one/kp", 0.7)
