@@ -502,10 +502,14 @@ class RosTransport(Transport):
             if publishes_clock(hub.space):
                 middleware.set_sim_time()
             async with ros_time(hub.space):
-                await middleware.run(link, opened)
+                await self.run_link(hub, link, opened)
         finally:
             link.close()
             hub.detach(link)
+
+    async def run_link(self, hub: Hub, link: RosLink, opened: Callable[[], object]) -> None:
+        """Run the middleware of a link, and what a network has beside topics and services."""
+        await link.middleware.run(link, opened)
 
 
 def ros_transport(transport: Transport | str, options: RosOptions) -> RosTransport:

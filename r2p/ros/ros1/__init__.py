@@ -2,6 +2,7 @@
 
 In the order to read it:
 
+    transport      the link, and beside it parameters, on the parameter server
     middleware     the link's nodes on a ROS 1 network; it joins the two halves below
     names, environment    full names, remappings, and where the master and this computer are
     xmlrpc         calls between nodes, with xmlrpc_codec for their bytes
@@ -13,17 +14,16 @@ In the order to read it:
 import os
 from typing import TYPE_CHECKING, Any
 
-from r2p.ros.link import RosTransport
 from r2p.ros.options import URL_OPTIONS, from_parsed
 from r2p.ros.ros1.environment import find_address
-from r2p.ros.ros1.middleware import Ros1Middleware
+from r2p.ros.ros1.transport import Ros1Transport
 from r2p.transports.url import Url
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-def from_url(url: Url) -> RosTransport:
+def from_url(url: Url) -> Ros1Transport:
     """`ros1:[http://MASTER:11311]`; without a master, the one that `ROS_MASTER_URI` names. Raises TransportError.
 
     Options: those of `r2p.ros.options`, and `host`: the address by which other computers reach this one, in place of
@@ -32,4 +32,4 @@ def from_url(url: Url) -> RosTransport:
     known: dict[str, Callable[[str], Any]] = {**URL_OPTIONS, "host": str}
     parsed = url.parsed(known)
     address = find_address(url.address, os.environ, {"hostname": parsed.pop("host", "")})
-    return RosTransport(f"ros1:{url.address}", lambda _hub: Ros1Middleware(address), from_parsed(parsed))
+    return Ros1Transport(f"ros1:{url.address}", address, from_parsed(parsed))

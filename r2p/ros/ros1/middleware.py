@@ -51,6 +51,11 @@ class Ros1Middleware(Middleware):
         self._closing: set[TcprosConnection] = set()
 
     @property
+    def session(self) -> MasterSession:
+        """Return what talks to the master."""
+        return self._session
+
+    @property
     def lost(self) -> Counter[str]:
         """The link's counter of losses, by reason."""
         return self._context.lost

@@ -13,12 +13,12 @@ from typing import Final
 from r2p.codecs.parameters import Name
 from r2p.errors import Error
 from r2p.ros.exposed_parameters import ExposedParameters
+from r2p.ros.graph_names import GraphNames
 from r2p.ros.ros1.master import MasterClient, MasterError
 from r2p.ros.ros1.names import namespace_of
 from r2p.ros.ros1.registration import MasterSession
 from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError
 from r2p.ros.ros1.xmlrpc_codec import Value
-from r2p.ros.topics import GraphNames
 from r2p.transports.link import Hub, Link
 
 _NAME: Final = "/r2p_parameters"
@@ -79,7 +79,10 @@ class ParameterMirror:
             while True:
                 await self._wake.wait()
                 self._wake.clear()
-                await self._settle_all()
+                try:
+                    await self._settle_all()
+                except Exception as error:  # noqa: BLE001 - counted and logged
+                    self._link.stats.lost.internal_error(error)
         finally:
             following.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -90,11 +93,16 @@ class ParameterMirror:
 
     def _module_changed(self, module: str) -> None:
         parameters = self._exposed.modules.get(module, {})
-        keys = {f"{self._node_name(module, name[0])}/{name[1]}": (name, info) for name, info in parameters.items()}
+        keys = {self._key(module, name): (name, info) for name, info in parameters.items()}
         for key, (name, info) in keys.items():
             value: Value = [*info.value] if isinstance(info.value, tuple) else info.value
             known = self._mirrored.get(key)
-            if known is None:
+            if known is None and (other := self._clash(key)):
+                text = (
+                    f"{info.full_name} is not on the parameter server: {other} is there, and one can't be in the other"
+                )
+                self._notice(key, text)
+            elif known is None:
                 self._mirrored[key] = _Mirrored(key, module, name, value)
                 self._watch(key)
             elif known.ours != value:
@@ -103,6 +111,16 @@ class ParameterMirror:
         for key in [key for key, each in self._mirrored.items() if each.module == module and key not in keys]:
             self._mark([key])
             self._mirrored[key].module = ""
+
+    def _key(self, module: str, name: Name) -> str:
+        """Return the key of a parameter: parts of its name are namespaces."""
+        return f"{self._node_name(module, name[0])}/{name[1].replace('.', '/')}"
+
+    def _clash(self, key: str) -> str:
+        """Return the key of a parameter that is a namespace of this one, or in it; empty if there is none."""
+        return next(
+            (each for each in self._mirrored if f"{key}/".startswith(f"{each}/") or each.startswith(f"{key}/")), ""
+        )
 
     def _watch(self, key: str) -> None:
         namespace = namespace_of(key)
