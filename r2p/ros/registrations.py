@@ -52,20 +52,18 @@ class Registrations:
         self._add_nodes()
 
     def declare(self, name: str, role: int | str, endpoints: Collection[Registered]) -> None:
-        """Have these endpoints of a topic or service in a role, and no others. New ones come first: no node ends in
-        between.
-        """
+        """Have these endpoints of a topic or service in a role, and no others. No node ends in between."""
         wanted = {each for each in endpoints if each.node not in self.refused}
         before = self._endpoints.get((name, role), set())
         new, gone = _sorted(wanted - before), _sorted(before - wanted)
         self._counts.update(each.node for each in new)
         self._add_nodes()
         register, unregister = self._methods[role]
-        for endpoint in new:
-            register(endpoint)
-        for endpoint in gone:
+        for endpoint in gone:  # first: a new one may only differ in its type or quality of service
             unregister(endpoint)
             decrement(self._counts, endpoint.node)
+        for endpoint in new:
+            register(endpoint)
         self._remove_nodes()
         if wanted:
             self._endpoints[name, role] = wanted

@@ -10,6 +10,7 @@ from r2p import BridgeOptions, Module
 from r2p.messages import layout
 from r2p.msg import Float32, Pose3, String, Velocity3
 from r2p.ros.discovery import GATEWAYS
+from r2p.ros.middleware import Qos
 from r2p.ros.topics import ros_class
 from r2p.testing.network import Network, node_in
 from tests.ros.fake import FakeRosNetwork
@@ -169,3 +170,37 @@ async def test_gateways_of_two_robots_in_their_namespaces(version: int) -> None:
         topics = {each.topic for each in network.graph(user).publishers if each.topic not in ("/rosout", "/robot1/log")}
         assert [len(each.queue) for each in subscribers] == [0, 1]
     assert topics == {"/robot0/battery", "/robot1/battery", GATEWAYS}
+
+
+@both
+@pytest.mark.virtual_time
+async def test_a_subscriber_that_comes_later_gets_its_type(version: int) -> None:
+    """Until then the topic has the type of ROS, as nobody behind the gateway knows another one."""
+    network, bus = FakeRosNetwork(version), Network()
+    user = network.node("/user")
+    twist = ros_class("geometry_msgs/Twist", version)
+    user.advertise("/cmd_vel", twist)
+    async with gateway("GW", bus, network), bus.node("BASE") as base:
+        await asyncio.sleep(4)
+        subscriber = base.subscribe("cmd_vel", Velocity3)
+        await asyncio.sleep(4)
+        user.publish("/cmd_vel", twist())
+        assert await subscriber.fetch() == Velocity3(0.0, 0.0, 0.0)
+
+
+@both
+@pytest.mark.virtual_time
+async def test_latched_values_pass_the_gateway(version: int) -> None:
+    network, bus = FakeRosNetwork(version), Network()
+    user = network.node("/user")
+    user.publish("/map", Speed(7.0), Qos(transient_local=True))
+    async with gateway("GW", bus, network), bus.node("BASE") as base:
+        plan = base.advertise("plan", Speed, latch=True)
+        await plan.publish(Speed(1.0))
+        await plan.publish(Speed(2.0))
+        await asyncio.sleep(4)
+        late = user.subscribe("/plan", Speed, Qos(transient_local=True))
+        maps = base.subscribe("map", Speed)
+        await asyncio.sleep(4)
+        assert late == [Speed(2.0)]
+        assert await maps.fetch() == Speed(7.0)
