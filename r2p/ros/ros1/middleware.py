@@ -16,10 +16,19 @@ from collections.abc import Callable, Iterable
 
 from r2p.clock import Backoff
 from r2p.errors import NoServer
-from r2p.ros.middleware import Middleware, MiddlewareUser, RosEndpoint, RosPeerEndpoint, RosServer, RosService
+from r2p.ros.middleware import (
+    Middleware,
+    MiddlewareUser,
+    RosEndpoint,
+    RosGraph,
+    RosPeerEndpoint,
+    RosServer,
+    RosService,
+)
 from r2p.ros.ros1.connections import Ros1Context, TcprosConnection, TcprosListener
 from r2p.ros.ros1.environment import RosAddress
 from r2p.ros.ros1.master import MasterError
+from r2p.ros.ros1.probes import PROBE_S, ServiceProbes
 from r2p.ros.ros1.publishers import Ros1Publication, SubscriberConnection
 from r2p.ros.ros1.registration import MasterSession
 from r2p.ros.ros1.services import Ros1Callers, Ros1Server
@@ -48,6 +57,7 @@ class Ros1Middleware(Middleware):
         """The slave URIs of each topic's publishers, by what the master has last reported to which node and topic."""
         self._servers: dict[tuple[str, str], Ros1Server] = {}
         self._callers = Ros1Callers(self._context)
+        self._probes = ServiceProbes(self._context, self._probe, lambda: self._session.look_soon())
         self._closing: set[TcprosConnection] = set()
 
     @property
@@ -74,6 +84,7 @@ class Ros1Middleware(Middleware):
             await self._session.run(user, opened)
         finally:
             asked.cancel()
+            self._probes.close()
             await self._close()
 
     def set_sim_time(self) -> None:
@@ -159,7 +170,7 @@ class Ros1Middleware(Middleware):
             self._connect(subscription)
 
     async def describe(self, endpoint: RosPeerEndpoint) -> str:
-        session, node = self._session, next(iter(self._listeners), "/r2p")
+        session, node = self._session, self._any_node()
         try:
             uri = await session.master.lookup_node(node, endpoint.node)
             return await definition_of(self._context, session.client, uri, node, endpoint.topic)
@@ -227,6 +238,15 @@ class Ros1Middleware(Middleware):
             if any(each.node == node for each in subscription.endpoints):
                 yield from map(_incoming, subscription.connections.values())
 
+    def complete_graph(self, graph: RosGraph) -> RosGraph:
+        """Return the graph with the types of services, which the master does not know."""
+        return self._probes.complete(graph)
+
+    async def _probe(self, service: str) -> RosService:
+        node = self._any_node()
+        address = await self._session.find_service(node, service, PROBE_S)
+        return await self._callers.probe(node, service, address)
+
     def _connect(self, subscription: Ros1Subscription) -> None:
         """Connect to the publishers of a topic."""
         publishers = self._publishers.get((subscription.node, subscription.topic))
@@ -238,14 +258,18 @@ class Ros1Middleware(Middleware):
         backoff = Backoff(self._context.random)
         while True:
             try:
-                node = next(iter(self._listeners), "/r2p")
-                self._context.keepalive = bool(await self._session.master.get_param(node, "/tcp_keepalive"))
+                value = await self._session.master.get_param(self._any_node(), "/tcp_keepalive")
+                self._context.keepalive = bool(value)
             except MasterError:  # it is not set
                 return
             except (OSError, XmlRpcError):  # the session says what is wrong with the master
                 await asyncio.sleep(backoff.delay())
             else:
                 return
+
+    def _any_node(self) -> str:
+        """Return a node in whose name something is asked."""
+        return next(iter(self._listeners), "/r2p")
 
     # The end
 

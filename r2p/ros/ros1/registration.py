@@ -303,7 +303,7 @@ class MasterSession:
         types = await self.master.get_topic_types(self._name())
         for entry in [each for each in self._registered if not _is_known(each, state)]:
             await self._find_lost(entry, state)
-        graph = _graph_of(state, types, before | self._nodes.keys())
+        graph = self.slaves.complete_graph(_graph_of(state, types, before | self._nodes.keys()))
         if graph != self._graph and self._user is not None:
             self._graph = graph
             self._user.graph_changed(graph)
@@ -338,7 +338,7 @@ class MasterSession:
     def publishers_updated(self, node: str, topic: str, publishers: list[str]) -> None:
         """Note all publishers of a topic."""
         self._updated.add((node, topic))
-        self._look_soon()
+        self.look_soon()
         own = {self.slave_uri(each) for each in self._nodes}
         if node in self._nodes and topic in self._nodes[node].subscriptions:
             self.slaves.publishers_changed(node, topic, [uri for uri in publishers if uri not in own])
@@ -444,7 +444,8 @@ class MasterSession:
     def _touch(self) -> None:
         self._changed.set()
 
-    def _look_soon(self) -> None:
+    def look_soon(self) -> None:
+        """Look at what is registered in a moment: something has changed."""
         self._look_at = min(self._look_at, _now() + _SOON_S)
         self._touch()
 

@@ -11,6 +11,7 @@ from typing import Final, Literal, NamedTuple, Protocol
 
 import msgspec
 
+from r2p.ros.middleware import RosGraph
 from r2p.ros.ros1.master import MasterError, value_of
 from r2p.ros.ros1.names import join
 from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError
@@ -55,6 +56,9 @@ class SlaveUser(Protocol):
 
     def connections(self, node: str) -> Iterable[BusConnection]:
         """Return all connections of topics that a node has."""
+
+    def complete_graph(self, graph: RosGraph) -> RosGraph:
+        """Return the graph with the types of services, which the master does not know."""
 
 
 class SlaveOwner(Protocol):

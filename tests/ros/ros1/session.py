@@ -89,6 +89,9 @@ class Recorder:
     def connections(self, node: str) -> Iterable[BusConnection]:
         return self.bus
 
+    def complete_graph(self, graph: RosGraph) -> RosGraph:
+        return graph
+
 
 @contextlib.asynccontextmanager
 async def running(uri: str, *nodes: str) -> AsyncIterator[tuple[MasterSession, Recorder]]:

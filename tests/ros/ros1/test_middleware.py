@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from r2p.errors import NoServer, ServiceError
-from r2p.ros.middleware import RosServer, RosService
+from r2p.ros.middleware import RosPeerServer, RosServer, RosService
 from r2p.ros.ros1.tcpros import frame
 from tests.ros.ros1.recorder import DONE, SET_BOOL, running, talk
 
 if TYPE_CHECKING:
+    from r2p.ros.ros1.middleware import Ros1Middleware
     from tests.ros.ros1.programs import Ros1, RospyPeer
 
 pytestmark = [pytest.mark.xdist_group("ros1"), pytest.mark.processes, pytest.mark.anyio]
@@ -62,6 +63,8 @@ async def test_services_go_both_ways_with_rospy(ros1: Ros1, rospy_peer: RospyPee
         await rospy_peer.do(
             "serve", service="/turn", type="std_srvs/SetBool", fields={"success": True, "message": "done"}
         )
+        turn = RosPeerServer("/peer", "/turn", SET_BOOL.name, SET_BOOL.checksum)
+        await user.until(lambda: turn in user.graph.servers)  # as its server was asked for its type
         for _ in range(3):
             assert await middleware.call("/blink", "/turn", SET_BOOL, b"\1", LIMIT) == DONE
         together = [middleware.call("/blink", "/turn", SET_BOOL, b"\0", LIMIT) for _ in range(5)]
@@ -92,6 +95,14 @@ async def test_a_wrong_type_is_said_in_words_on_both_sides(ros1: Ros1, rospy_pee
         await rospy_peer.do("unadvertise", topic="/wrong_in")
 
 
+async def publish_again(middleware: Ros1Middleware, topic: str, nodes: list[str]) -> None:
+    """Publish as each of these nodes, again and again."""
+    while True:
+        for node in nodes:
+            middleware.publish(node, topic, frame(node.encode()), 0)
+        await asyncio.sleep(0.05)
+
+
 async def test_twenty_nodes_of_one_process_are_twenty_ros_nodes(ros1: Ros1, rospy_peer: RospyPeer) -> None:
     names = [f"/fleet/robot{number}" for number in range(20)]
     async with running(ros1, *names) as (middleware, user):
@@ -101,12 +112,11 @@ async def test_twenty_nodes_of_one_process_are_twenty_ros_nodes(ros1: Ros1, rosp
             middleware.subscribe(talk("/fleet/all", name))
         await rospy_peer.do("subscribe", topic="/fleet/chat", type="std_msgs/String")
         await rospy_peer.do("advertise", topic="/fleet/all", type="std_msgs/String")
-        await user.until(lambda: ("subscriber joined", "/fleet/chat") in user.log)
+        publishing = asyncio.ensure_future(publish_again(middleware, "/fleet/chat", names))
         heard: set[str] = set()
-        while heard != set(names):  # rospy connects to some nodes twice while they register, and later to others
-            for name in names:
-                middleware.publish(name, "/fleet/chat", frame(name.encode()), 0)
+        while heard != set(names):  # while nodes register, rospy connects to some of them twice, and to others late
             heard |= {each["header"]["callerid"] for each in await rospy_peer.do("messages", topic="/fleet/chat")}
+        publishing.cancel()
         await user.until(lambda: user.log.count(("publisher found", "/fleet/all", "/peer", "std_msgs/String")) == 1)
         await rospy_peer.do("connected", topic="/fleet/all")
         await rospy_peer.do("publish", topic="/fleet/all", fields={"data": "once"})

@@ -29,24 +29,24 @@ def anyio_backend() -> tuple[str, dict[str, Any]]:
 
 async def test_tools_of_ros_see_and_use_a_node(ros1: Ros1) -> None:
     async with running(ros1) as (middleware, user):
-        middleware.advertise(talk("/chat", qos=Qos(transient_local=True)))
-        middleware.subscribe(talk("/in"))
+        middleware.advertise(talk("/tools/chat", qos=Qos(transient_local=True)))
+        middleware.subscribe(talk("/tools/in"))
         middleware.serve(RosServer("/blink", "/set", SET_BOOL))
-        middleware.publish("/blink", "/chat", frame(b"latched"), 0)
+        middleware.publish("/blink", "/tools/chat", frame(b"latched"), 0)
         user.serve = lambda request: b"\1" + frame(b"on" if request == b"\1" else b"off")
-        async with ros1.running("rostopic", "pub", "/in", "std_msgs/String", "hello"):
+        async with ros1.running("rostopic", "pub", "/tools/in", "std_msgs/String", "hello"):
             echo, info, call, node = await asyncio.gather(
-                ros1.run("rostopic", "echo", "-n", "1", "/chat"),
+                ros1.run("rostopic", "echo", "-n", "1", "/tools/chat"),
                 ros1.run("rosservice", "info", "/set"),
                 ros1.run("rosservice", "call", "/set", "true"),
                 ros1.run("rosnode", "info", "/blink"),
             )
-            await user.until(lambda: user.data("/in"))
+            await user.until(lambda: user.data("/tools/in"))
         assert 'data: "latched"' in echo.output
         assert "Type: std_srvs/SetBool" in info.output
         assert 'message: "on"' in call.output
-        assert " * /chat [std_msgs/String]" in node.output
-        assert user.data("/in") == [frame(b"hello")]
+        assert " * /tools/chat [std_msgs/String]" in node.output
+        assert user.data("/tools/in") == [frame(b"hello")]
 
 
 async def test_the_cpp_relay_and_a_bag_carry_any_type(ros1: Ros1, tmp_path: object) -> None:
@@ -79,19 +79,19 @@ async def test_the_cpp_relay_and_a_bag_carry_any_type(ros1: Ros1, tmp_path: obje
 
 async def test_peers_that_are_killed_are_replaced_by_new_ones(ros1: Ros1) -> None:
     async with running(ros1) as (middleware, user):
-        middleware.advertise(talk("/out"))
-        middleware.subscribe(talk("/in"))
+        middleware.advertise(talk("/mortal/out"))
+        middleware.subscribe(talk("/mortal/in"))
         for attempt in (1, 2):
             with ros1.peer("mortal") as peer:
-                await peer.do("subscribe", topic="/out", type="std_msgs/String")
-                await peer.do("advertise", topic="/in", type="std_msgs/String", latch=True)
-                await peer.do("publish", topic="/in", fields={"data": str(attempt)})
-                await user.until(lambda: len(user.data("/in")) == attempt)  # noqa: B023
-                await user.until(lambda: user.log.count(("subscriber joined", "/out")) == attempt)  # noqa: B023
-                middleware.publish("/blink", "/out", frame(b"hello"), 0)
-                await peer.do("messages", topic="/out")
+                await peer.do("subscribe", topic="/mortal/out", type="std_msgs/String")
+                await peer.do("advertise", topic="/mortal/in", type="std_msgs/String", latch=True)
+                await peer.do("publish", topic="/mortal/in", fields={"data": str(attempt)})
+                await user.until(lambda: len(user.data("/mortal/in")) == attempt)  # noqa: B023
+                await user.until(lambda: user.log.count(("subscriber joined", "/mortal/out")) == attempt)  # noqa: B023
+                middleware.publish("/blink", "/mortal/out", frame(b"hello"), 0)
+                await peer.do("messages", topic="/mortal/out")
                 peer.kill()
-                await user.until(lambda: user.log.count(("subscribers gone", "/out")) == attempt)  # noqa: B023
-                await user.until(lambda: user.log.count(("publisher gone", "/in", "/mortal")) == attempt)  # noqa: B023
-        await user.until(lambda: "no connection: /in" in user.notices)
-        assert "rosnode cleanup" in user.notices["no connection: /in"]
+                await user.until(lambda: user.log.count(("subscribers gone", "/mortal/out")) == attempt)  # noqa: B023
+                await user.until(lambda: user.log.count(("publisher gone", "/mortal/in", "/mortal")) == attempt)  # noqa: B023
+        await user.until(lambda: "no connection: /mortal/in" in user.notices)
+        assert "rosnode cleanup" in user.notices["no connection: /mortal/in"]

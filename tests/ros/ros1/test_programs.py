@@ -16,11 +16,11 @@ pytestmark = [pytest.mark.xdist_group("ros1"), pytest.mark.processes]
 
 @pytest.mark.anyio
 async def test_a_rospy_node_hears_a_tool_and_calls_itself(ros1: Ros1, rospy_peer: RospyPeer) -> None:
-    await rospy_peer.do("subscribe", topic="/chat", type="std_msgs/String")
-    async with ros1.running("rostopic", "pub", "/chat", "std_msgs/String", "hello"):
-        (heard,) = await rospy_peer.do("messages", topic="/chat")
+    await rospy_peer.do("subscribe", topic="/programs/chat", type="std_msgs/String")
+    async with ros1.running("rostopic", "pub", "/programs/chat", "std_msgs/String", "hello"):
+        (heard,) = await rospy_peer.do("messages", topic="/programs/chat")
     assert (heard["message"], heard["header"]["type"]) == ({"data": "hello"}, "std_msgs/String")
-    await rospy_peer.do("unsubscribe", topic="/chat")
+    await rospy_peer.do("unsubscribe", topic="/programs/chat")
     await rospy_peer.do("serve", service="/set", type="std_srvs/SetBool", fields={"success": True, "message": "on"})
     response = await rospy_peer.do("call", service="/set", type="std_srvs/SetBool", fields={"data": True})
     assert response == {"success": True, "message": "on"}
