@@ -7,6 +7,7 @@ tracebacks without the frames of r2p.
 import asyncio
 import contextlib
 import difflib
+import functools
 import importlib
 import importlib.util
 import inspect
@@ -30,7 +31,7 @@ from r2p.parameters.sources import ParameterSource, from_options, of_module, rea
 from r2p.tools.config import Settings
 from r2p.tools.options import Param, Params, ParamsFile, Via
 from r2p.tools.output import notify
-from r2p.tools.session import UsageError, check_urls, service, settings
+from r2p.tools.session import Run, UsageError, check_urls, run_virtually, service, settings
 
 logger = logging.getLogger("r2p.runner")
 
@@ -55,6 +56,11 @@ _LoadDir = Annotated[
 ]
 
 
+_SimTime = Annotated[
+    bool, typer.Option("--sim-time", help="Follow the /clock of ROS, such as a simulator's (use_sim_time).")
+]
+
+
 class Program(msgspec.Struct, frozen=True):
     """A function to run as a node of this name."""
 
@@ -62,7 +68,11 @@ class Program(msgspec.Struct, frozen=True):
     name: str
 
 
-@service
+def _loop(*, sim_time: bool, **_others: object) -> Run | None:
+    return functools.partial(run_virtually, follow=True) if sim_time else None
+
+
+@functools.partial(service, loop=_loop)
 async def command(
     functions: _Functions = None,
     module: Annotated[
@@ -81,6 +91,7 @@ async def command(
     param: Param = None,
     allow_load: _AllowLoad = False,
     load_dir: _LoadDir = None,
+    sim_time: _SimTime = False,  # read by `_loop`
     via: Via = None,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended, or Ctrl-C.

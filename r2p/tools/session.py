@@ -27,6 +27,7 @@ import errno
 import functools
 import inspect
 import os
+import signal
 import string
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
 from typing import Any, TypeVar
@@ -49,6 +50,8 @@ Opening = Callable[[Settings], contextlib.AbstractAsyncContextManager[Any]]
 """Opens what a command works on instead of a Session."""
 Endless = Callable[[Mapping[str, Any]], bool]
 """Says of the arguments and options of a command whether it goes on until a signal ends it."""
+Run = Callable[[Callable[[], Coroutine[Any, Any, None]]], object]
+"""Runs the main function of a command."""
 Check = Callable[[Settings, Mapping[str, Any]], object]
 """Raises UsageError for arguments and options that can't be right, whatever the network has."""
 
@@ -417,18 +420,37 @@ def joined(
     return _with_options(run, body, session=True)
 
 
-def standalone(body: Callable[..., Awaitable[None]], *, endless: bool = False) -> Callable[..., None]:
-    """Make a command for `main.COMMANDS` of a coroutine function that joins no network as a tool; it adds -v and -q."""
+def standalone(
+    body: Callable[..., Awaitable[None]], *, endless: bool = False, loop: Callable[..., Run | None] | None = None
+) -> Callable[..., None]:
+    """Make a command for `main.COMMANDS` of a coroutine function that joins no network as a tool; it adds -v and -q.
+
+    `loop` returns what replaces `r2p.run_main`, for the command's arguments.
+    """
 
     def run(*, verbose: int, quiet: int, **given: Any) -> None:
-        execute(functools.partial(body, **given), verbose=verbose, quiet=quiet, endless=endless)
+        replaced = None if loop is None else loop(**given)
+        execute(functools.partial(body, **given), verbose=verbose, quiet=quiet, endless=endless, run=replaced)
 
     return _with_options(run, body, session=False)
 
 
-def service(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+def service(
+    body: Callable[..., Awaitable[None]], *, loop: Callable[..., Run | None] | None = None
+) -> Callable[..., None]:
     """Make a command as `standalone` does, which goes on until a signal ends it."""
-    return standalone(body, endless=True)
+    return standalone(body, endless=True, loop=loop)
+
+
+def run_virtually(main: Callable[[], Coroutine[Any, Any, None]], **options: Any) -> None:
+    """Run a command under virtual time, with the options of `r2p.sim.run`: for the argument `run` of `execute`."""
+    from r2p import sim  # a tenth of a second that other commands need not wait for
+
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which Python raises itself
+    try:
+        sim.run(main, **options)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _with_options(run: Callable[..., None], body: Callable[..., object], *, session: bool) -> Callable[..., None]:
@@ -474,7 +496,7 @@ def execute(
     verbose: int = 0,
     quiet: int = 0,
     endless: bool = False,
-    run: Callable[[Callable[[], Coroutine[Any, Any, None]]], object] | None = None,
+    run: Run | None = None,
 ) -> None:
     """Run a command until it ends or a signal ends it, and exit with its code. `run` replaces `r2p.run_main`.
 

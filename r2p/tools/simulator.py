@@ -11,11 +11,10 @@ import importlib.util
 import math
 import os
 import shutil
-import signal
 import sys
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import typer
 from rich.console import Console, Group, RenderableType
@@ -36,7 +35,7 @@ from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, OdometryF
 from r2p.sim.robots.triskar2 import square
 from r2p.tools.config import CONFIG, Settings, did_you_mean
 from r2p.tools.options import Params, ParamsFile, Quiet, Verbose, Via, time_option
-from r2p.tools.session import UsageError, check_urls, execute, moments, settings
+from r2p.tools.session import UsageError, check_urls, execute, moments, run_virtually, settings
 
 DEBUG = "tcp-listen:0"
 """The debug line, on the loopback interface, at a free port."""
@@ -66,20 +65,27 @@ _WALL, _PATH = "#", "."
 _ARROWS = ">^<v"
 
 
+_Speed = Annotated[
+    float | None,
+    typer.Option(metavar="N", min=0.1, max=100.0, help="N times as fast as real time; ROS nodes follow its /clock."),
+]
+_Square = Annotated[bool, typer.Option("--square", help="Let a PC drive it along squares; implied by --fast.")]
+_Fast = Annotated[
+    bool, typer.Option("--fast", help="As fast as possible, in virtual time; other programs can't connect.")
+]
+
+
 def command(
     robot: Annotated[
         Literal["triskar2"], typer.Argument(metavar="ROBOT", help="The omnidirectional robot of the thesis.")
     ] = "triskar2",
-    fast: Annotated[
-        bool, typer.Option("--fast", help="As fast as possible, in virtual time; other programs can't connect.")
-    ] = False,
+    fast: _Fast = False,
+    speed: _Speed = None,
     duration: Annotated[
         float | None, time_option("--duration", "How long; default: until Ctrl-C; --fast: 60 s.")
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of all random numbers.")] = 0,
-    square: Annotated[
-        bool, typer.Option("--square", help="Let a PC drive it along squares; implied by --fast.")
-    ] = False,
+    square: _Square = False,
     bus: Annotated[bool, typer.Option("--bus", help="At the end, report how much each node sent on the bus.")] = False,
     allow_control: Annotated[
         bool, typer.Option("--allow-control", help="Let the gateway accept REBOOT, BOOTLOAD and changes from IP links.")
@@ -100,6 +106,8 @@ def command(
     """
 
     async def main() -> None:
+        if fast and speed is not None:
+            raise UsageError("--fast is as fast as possible: leave out either --fast or --speed")
         if fast and via:
             raise UsageError("--fast runs in virtual time, so other programs can't connect: leave out --via or --fast")
         check_urls(via or [])
@@ -117,6 +125,7 @@ def command(
             parameters=parameters,
         )
 
+    virtually = functools.partial(run_virtually, seed=seed, speed=None if fast else speed)
     # Only errors are logged: any other line would tear the display apart.
     endless = duration is None and not fast
     execute(
@@ -124,16 +133,8 @@ def command(
         verbose=verbose,
         quiet=quiet + 2,
         endless=endless,
-        run=functools.partial(_run_virtually, seed) if fast else None,
+        run=virtually if fast or speed is not None else None,
     )
-
-
-def _run_virtually(seed: int, main: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which Python raises itself
-    try:
-        sim.run(main, seed=seed)
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def default_links() -> list[str]:

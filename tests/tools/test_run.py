@@ -23,6 +23,14 @@ from tests.tools.rig import listening, process
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+FOLLOWS = """
+import asyncio
+from r2p.clock import SteeredClock, clock_of
+
+async def shown(node):
+    print("follows:", isinstance(clock_of(), SteeredClock), flush=True)
+    await asyncio.Event().wait()
+"""
 NODES = """
 import asyncio, time
 import r2p
@@ -225,6 +233,12 @@ def test_it_says_what_runs_and_ends_with_its_nodes() -> None:
     assert (code, out) == (0, "ran\nran\n")
     assert err == "r2p: module PC7 runs once, again; links: none, local only (--via joins a network); Ctrl-C ends it\n"
     assert run("nodes.py:once", "-q")[2] == ""
+
+
+@pytest.mark.processes
+def test_it_may_follow_the_time_of_ros(tmp_path: Path) -> None:
+    (tmp_path / "clock.py").write_text(FOLLOWS, encoding="ascii")
+    assert run(f"{tmp_path}/clock.py:shown", "--sim-time", signals=1)[:2] == (0, "follows: True\n")
 
 
 @pytest.mark.processes

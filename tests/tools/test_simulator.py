@@ -306,6 +306,16 @@ def test_fast_and_a_link_to_the_outside_do_not_go_together() -> None:
     assert "--fast runs in virtual time" in ended.stderr
 
 
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [(["--speed", "0"], "at least 0.1"), (["--fast", "--speed", "2"], "leave out either --fast or --speed")],
+)
+def test_speeds_that_can_not_be(options: list[str], reason: str) -> None:
+    result = CliRunner().invoke(app, ["sim", *options])
+    assert result.exit_code == 2
+    assert reason in result.output
+
+
 def test_parameters_come_from_files_and_options(tmp_path: Path) -> None:
     """The last file wins, and options win over files; one with a module is for this module only."""
     one, two = tmp_path / "one.toml", tmp_path / "two.toml"
