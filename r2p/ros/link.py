@@ -110,6 +110,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._classes = TopicClasses(hub, self._types, self._background, self._describe, self._touch)
         self._registrations = Registrations(middleware, self.names.node(hub.space.module))
         self.services = RosServices(self, hub, self._ros, self._registrations)
+        self.own_servers: dict[str, Callable[[bytes, Answer, Refuse], Cancel]] = {}
+        """What handles requests for services that ROS's nodes have and r2p's have not, by their names in ROS."""
         self._published: dict[str, _Published] = {}
         self._subscribed: dict[str, RosTopic] = {}
         self._by_ros_name: dict[str, str] = {}
@@ -458,7 +460,15 @@ class RosLink(BufferedLink, MiddlewareUser):
     def received(self, messages: list[RosArrival]) -> None:
         self.receive(messages)
 
+    @property
+    def registrations(self) -> Registrations:
+        """Return the ROS nodes of this link, and what they have."""
+        return self._registrations
+
     def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
+        own = self.own_servers.get(service)
+        if own is not None:
+            return own(request, answer, refuse)
         return self.services.requested(service, request, answer, refuse)
 
     def parameter_changed(self, key: str, value: object) -> None:

@@ -49,6 +49,8 @@ class Registrations:
         self._counts: Counter[str] = Counter()
         self.refused: set[str] = set()
         """Nodes that are not shown, as others have their names."""
+        self._shown: Callable[[str], object] = _do_nothing
+        self._gone: Callable[[str], object] = _do_nothing
         self._add_nodes()
 
     def declare(self, name: str, role: int | str, endpoints: Collection[Registered]) -> None:
@@ -69,6 +71,12 @@ class Registrations:
             self._endpoints[name, role] = wanted
         else:
             self._endpoints.pop((name, role), None)
+
+    def watch(self, shown: Callable[[str], object], gone: Callable[[str], object]) -> None:
+        """Call `shown` with each node, now and when a new one is shown, and `gone` before a node is removed."""
+        self._shown, self._gone = shown, gone
+        for node in sorted(self.nodes):
+            shown(node)
 
     def keep_module_node(self) -> None:
         """Show the module as a ROS node from now on, whatever other nodes it has."""
@@ -102,14 +110,14 @@ class Registrations:
         for node in sorted(self._wanted() - self.nodes):
             self._middleware.add_node(node)
             self.nodes.add(node)
+            self._shown(node)
 
     def _remove_nodes(self) -> None:
-        wanted = self._wanted()
-        for node in sorted(wanted - self.nodes):  # the module's own one, before the last other one goes
-            self._middleware.add_node(node)
-        for node in sorted(self.nodes - wanted):
+        self._add_nodes()  # the module's own one, before the last other one goes
+        for node in sorted(self.nodes - self._wanted()):
+            self._gone(node)
             self._middleware.remove_node(node)
-        self.nodes = wanted
+            self.nodes.remove(node)
 
 
 def _sorted(endpoints: Collection[Registered]) -> list[Registered]:
