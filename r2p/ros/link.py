@@ -151,6 +151,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         name = self.names.to_ros(topic)
         travel, reason = self._travel(topic, name) if publishes or subscribes else (None, "")
         self._note_off_ros(topic, reason)
+        if travel is None and not reason and (publishes or subscribes) and self._background.is_pending(topic):
+            return  # until it is known, it stays as it is: other nodes are connected
         if travel is None or name is None:
             self._remove(topic)
             self._learn_type(topic)
@@ -238,6 +240,7 @@ class RosLink(BufferedLink, MiddlewareUser):
     def _subscribe(self, topic: str, name: str, travel: RosTopic | None) -> None:
         if travel is None:
             self._subscribed.pop(topic, None)
+            self._found.pop(topic, None)
             self._registrations.declare(topic, ROLE_SUBSCRIBES, set())
             return
         self._subscribed[topic] = travel
@@ -417,6 +420,7 @@ class RosLink(BufferedLink, MiddlewareUser):
     def middleware_down(self, reason: str) -> None:
         self.services.graph_with_services(RosGraph())
         self._found.clear()
+        self._latched.clear()
         self.on_down(reason)
 
     def middleware_waits(self, reason: str) -> None:
