@@ -108,10 +108,11 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._types = TopicTypes(middleware.version, options, hub.space.module, self.stats.lost)
         self._background = BackgroundResults(hub.space.loop, self._touch)
         self._classes = TopicClasses(hub, self._types, self._background, self._describe, self._touch)
-        self._registrations = Registrations(middleware, self.names.node(hub.space.module))
+        module_node = self.names.node(hub.space.module)
+        self._registrations = Registrations(
+            middleware, module_node, hub.space.loop, lambda: self._touch(LOG), at_once=hub.observer
+        )
         self.services = RosServices(self, hub, self._ros, self._registrations)
-        self.own_servers: dict[str, Callable[[bytes, Answer, Refuse], Cancel]] = {}
-        """What handles requests for services that ROS's nodes have and r2p's have not, by their names in ROS."""
         self._published: dict[str, _Published] = {}
         self._subscribed: dict[str, RosTopic] = {}
         self._by_ros_name: dict[str, str] = {}
@@ -151,8 +152,6 @@ class RosLink(BufferedLink, MiddlewareUser):
         name = self.names.to_ros(topic)
         travel, reason = self._travel(topic, name) if publishes or subscribes else (None, "")
         self._note_off_ros(topic, reason)
-        if travel is None and not reason and (publishes or subscribes) and self._background.is_pending(topic):
-            return  # until it is known, it stays as it is: other nodes are connected
         if travel is None or name is None:
             self._remove(topic)
             self._learn_type(topic)
@@ -228,6 +227,10 @@ class RosLink(BufferedLink, MiddlewareUser):
         nodes = self._nodes(topic, ROLE_PUBLISHES)
         shown = sorted(set(nodes.values()))
         default = shown[0] if len(shown) == 1 else self._registrations.module_node
+        if topic == LOG and default == self._registrations.module_node and not self._registrations.shows_module_node:
+            self._registrations.declare(topic, ROLE_PUBLISHES, set())  # until one of its nodes is shown, or itself is
+            self._apply(self._ros.set_subscribed(topic, subscribed=False))
+            return
         self._published[topic] = _Published(name, travel.encode, default, nodes)
         latched = self._ros.publishes_latched(topic)
         qos = publisher_qos(self._space.topics.get(topic), latched=latched, change=lookup(self.options.qos, topic))
@@ -240,7 +243,6 @@ class RosLink(BufferedLink, MiddlewareUser):
     def _subscribe(self, topic: str, name: str, travel: RosTopic | None) -> None:
         if travel is None:
             self._subscribed.pop(topic, None)
-            self._found.pop(topic, None)
             self._registrations.declare(topic, ROLE_SUBSCRIBES, set())
             return
         self._subscribed[topic] = travel
@@ -406,6 +408,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.middleware.resume()
 
     def close(self) -> None:
+        self._registrations.close()
         self.services.close()
         self._classes.close()
         self._background.close()
@@ -420,7 +423,6 @@ class RosLink(BufferedLink, MiddlewareUser):
     def middleware_down(self, reason: str) -> None:
         self.services.graph_with_services(RosGraph())
         self._found.clear()
-        self._latched.clear()
         self.on_down(reason)
 
     def middleware_waits(self, reason: str) -> None:
@@ -464,15 +466,7 @@ class RosLink(BufferedLink, MiddlewareUser):
     def received(self, messages: list[RosArrival]) -> None:
         self.receive(messages)
 
-    @property
-    def registrations(self) -> Registrations:
-        """Return the ROS nodes of this link, and what they have."""
-        return self._registrations
-
     def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
-        own = self.own_servers.get(service)
-        if own is not None:
-            return own(request, answer, refuse)
         return self.services.requested(service, request, answer, refuse)
 
     def parameter_changed(self, key: str, value: object) -> None:

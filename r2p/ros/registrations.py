@@ -2,15 +2,18 @@
 servers, by the services.
 """
 
+import asyncio
 from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Any, TypeAlias
 
 import msgspec
 
+from r2p.clock import Alarm, clock_of
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.discovery.directory import decrement
 from r2p.ros.middleware import Middleware, RosEndpoint, RosServer
+from r2p.units import SECOND
 
 SERVES, CALLS = "serves", "calls"
 """The roles of a node in a service, beside ROLE_PUBLISHES and ROLE_SUBSCRIBES in a topic."""
@@ -30,11 +33,22 @@ class Registrations:
     """Registers the difference between what a topic has and should have.
 
     A ROS node is shown from its first endpoint to its last one. While there is none, the module itself is a ROS node,
-    `module_node`; after `keep_module_node` it always is.
+    `module_node`: `at_once`, or after a second, as programs start and end without endpoints. After `keep_module_node`
+    it always is.
     """
 
-    def __init__(self, middleware: Middleware, module_node: str) -> None:
+    def __init__(
+        self,
+        middleware: Middleware,
+        module_node: str,
+        loop: asyncio.AbstractEventLoop,
+        on_alone: Callable[[], object],
+        *,
+        at_once: bool,
+    ) -> None:
+        """`on_alone` is called when the module becomes a ROS node, as it has no others."""
         self.module_node = module_node
+        self._on_alone = on_alone
         self.nodes: set[str] = set()
         """The ROS nodes of this link."""
         self._middleware = middleware
@@ -49,9 +63,15 @@ class Registrations:
         self._counts: Counter[str] = Counter()
         self.refused: set[str] = set()
         """Nodes that are not shown, as others have their names."""
-        self._shown: Callable[[str], object] = _do_nothing
-        self._gone: Callable[[str], object] = _do_nothing
+        self._at_once = self._alone = at_once
+        self._clock = clock_of(loop)
+        self._alarm = Alarm(loop, self._show_module_node, background=True)
+        self._note_alone()
         self._add_nodes()
+
+    def close(self) -> None:
+        """Show no node any more."""
+        self._alarm.close()
 
     def declare(self, name: str, role: int | str, endpoints: Collection[Registered]) -> None:
         """Have these endpoints of a topic or service in a role, and no others. No node ends in between."""
@@ -59,6 +79,7 @@ class Registrations:
         before = self._endpoints.get((name, role), set())
         new, gone = _sorted(wanted - before), _sorted(before - wanted)
         self._counts.update(each.node for each in new)
+        self._note_alone()
         self._add_nodes()
         register, unregister = self._methods[role]
         for endpoint in gone:  # first: a new one may only differ in its type or quality of service
@@ -66,17 +87,17 @@ class Registrations:
             decrement(self._counts, endpoint.node)
         for endpoint in new:
             register(endpoint)
+        self._note_alone()
         self._remove_nodes()
         if wanted:
             self._endpoints[name, role] = wanted
         else:
             self._endpoints.pop((name, role), None)
 
-    def watch(self, shown: Callable[[str], object], gone: Callable[[str], object]) -> None:
-        """Call `shown` with each node, now and when a new one is shown, and `gone` before a node is removed."""
-        self._shown, self._gone = shown, gone
-        for node in sorted(self.nodes):
-            shown(node)
+    @property
+    def shows_module_node(self) -> bool:
+        """Return whether the module itself is a ROS node."""
+        return self.module_node in self.nodes
 
     def keep_module_node(self) -> None:
         """Show the module as a ROS node from now on, whatever other nodes it has."""
@@ -102,22 +123,37 @@ class Registrations:
         for (name, role), endpoints in list(self._endpoints.items()):
             self.declare(name, role, endpoints)
 
+    def _note_alone(self) -> None:
+        """Note whether there is no endpoint, which makes the module a ROS node after a second."""
+        if self._at_once:
+            self._alone = not self._counts
+        elif self._counts:
+            self._alone = False
+            self._alarm.set(None)
+        elif not self._alone:
+            self._alarm.set(self._clock.monotonic() + SECOND)
+
+    def _show_module_node(self) -> None:
+        self._alone = True
+        self._add_nodes()
+        self._on_alone()
+
     def _wanted(self) -> set[str]:
-        module = {self.module_node} - self.refused if self._keep_module_node or not self._counts else set()
+        module = {self.module_node} - self.refused if self._keep_module_node or self._alone else set()
         return self._counts.keys() | module
 
     def _add_nodes(self) -> None:
         for node in sorted(self._wanted() - self.nodes):
             self._middleware.add_node(node)
             self.nodes.add(node)
-            self._shown(node)
 
     def _remove_nodes(self) -> None:
-        self._add_nodes()  # the module's own one, before the last other one goes
-        for node in sorted(self.nodes - self._wanted()):
-            self._gone(node)
+        wanted = self._wanted()
+        for node in sorted(wanted - self.nodes):  # the module's own one, before the last other one goes
+            self._middleware.add_node(node)
+        for node in sorted(self.nodes - wanted):
             self._middleware.remove_node(node)
-            self.nodes.remove(node)
+        self.nodes = wanted
 
 
 def _sorted(endpoints: Collection[Registered]) -> list[Registered]:
