@@ -6,6 +6,7 @@ One task of the client reads the feedback of all its goals, one the states, and 
 """
 
 import asyncio
+import contextlib
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine
 from types import TracebackType
@@ -41,6 +42,7 @@ from r2p.services.server import HandlerOwner
 FEEDBACK_MAX = 64
 """Feedback of a goal that waits to be read; with one more, the oldest is lost, and counted."""
 
+_CONNECTED_WITHIN = 1.0  # seconds that the feedback may be found later than the services
 _CALL = 1800.0  # seconds that one call for a result waits; then it is called again
 _LOOK = 1.0  # seconds between two looks whether the server is still there
 _GONE_AFTER = 10  # looks without it in a row
@@ -183,12 +185,17 @@ class ActionClient(HandlerOwner, Generic[G, R, F]):
         return self._send.servers
 
     async def ready(self, timeout: float | None = None) -> None:
-        """Wait until there is a server. Raises TimeoutError after `timeout` seconds, and Closed."""
+        """Wait until there is a server, whose feedback comes. Raises TimeoutError after `timeout` seconds, and Closed.
+
+        A server that does not show that it sends feedback is waited for no longer than a second.
+        """
         check_timeout(f"action {self.name}: the time-out of ready", timeout)
         try:
             async with asyncio.timeout(timeout):
                 for each in (self._send, self._cancel, self._get_result):
                     await each.ready()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._feedback.wait_publisher(), _CONNECTED_WITHIN)
         except TimeoutError:
             raise TimeoutError(f"action {self.name} has no server within {timeout:g} s") from None
 

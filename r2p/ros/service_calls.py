@@ -105,7 +105,7 @@ class RosCalls:
         if header.kind is Kind.CANCEL:
             if task is not None:
                 task.cancel()
-                self._answer(service, header, Kind.ERROR, b"cancelled by its caller", given)
+                self._send_answer(service, header, Kind.ERROR, b"cancelled by its caller", given)
         elif header.kind is Kind.REQUEST and task is None and not self._answer_again(service, header, given, left):
             self._begin(service, header, body, given, left)
 
@@ -150,6 +150,9 @@ class RosCalls:
     def _answer(self, service: CarriedService, header: ServiceHeader, kind: Kind, body: bytes, given: int) -> None:
         if kind is Kind.ERROR and not service.has_room_for_text:
             self._report(service, body.decode(errors="replace"))
+        self._send_answer(service, header, kind, body, given)
+
+    def _send_answer(self, service: CarriedService, header: ServiceHeader, kind: Kind, body: bytes, given: int) -> None:
         data = service.answer(header, kind, body)
         answers = self._answers.setdefault(service.name, RememberedAnswers())
         answers.put(header.instance, header.number, data, self._clock.monotonic(), 2 * given)
