@@ -13,7 +13,7 @@ from r2p.tools.completion import beginning, complete_type, silence
 from r2p.tools.options import Format
 from r2p.tools.output import Output, notify
 from r2p.tools.session import UsageError, group, settings, standalone
-from r2p.tools.types import Types, class_path, put_sizes, size_text, standard_types, type_name
+from r2p.tools.types import Types, class_path, load_interface, put_sizes, size_text, standard_types, type_name
 
 app = group("Show message types, and exchange them with C and ROS.")
 
@@ -94,18 +94,21 @@ async def export(
     With --c, each type gets a header, DIR/package/Name.h, in which the compiler checks its size and offsets. Types
     whose length varies have no struct, as firmware's messages have a fixed size.
 
-    With --ros1 or --ros2, DIR/package is one to put into the src of a workspace. Types of ROS's own packages are left
-    out. Bytes and checks of types are those that r2p uses with ROS.
+    With --ros1 or --ros2, DIR/package is one to put into the src of a workspace, with .msg, .srv and .action files.
+    Types of ROS's own packages are left out. Bytes and checks of types are those that r2p uses with ROS.
     """
     if c is None and ros1 is None and ros2 is None:
         raise UsageError("where to? give --c DIR for C headers, --ros1 DIR or --ros2 DIR for packages of ROS")
     known = Types(settings())
-    chosen = [known.load(text) for text in types or ()]
+    interfaces = {text: found for text in types or () if (found := load_interface(text)) is not None}
+    chosen = [known.load(text) for text in types or () if text not in interfaces]
     if c is not None:
+        if interfaces:
+            raise UsageError(f"{next(iter(interfaces))} has no C struct: give the types of its messages")
         _export_c(c, chosen, everything=not types)
     for version, folder in ((1, ros1), (2, ros2)):
         if folder is not None:
-            _export_ros(folder, version, chosen or _known())
+            _export_ros(folder, version, chosen if types else _known(), list(interfaces.values()))
 
 
 def _export_c(folder: Path, classes: list[type[r2p.Message]], *, everything: bool) -> None:
@@ -118,11 +121,11 @@ def _export_c(folder: Path, classes: list[type[r2p.Message]], *, everything: boo
     notify(f"{len(headers)} headers in {folder}: compile with -I {folder}")
 
 
-def _export_ros(folder: Path, version: int, classes: list[type[r2p.Message]]) -> None:
+def _export_ros(folder: Path, version: int, classes: list[type[r2p.Message]], interfaces: list[Any]) -> None:
     from r2p.ros.packages import packages  # later: commands that need no ROS start faster
 
     try:
-        files = packages(classes, version)
+        files = packages(classes, version, interfaces)
     except r2p.MessageError as error:
         raise UsageError(str(error)) from error
     if not files:

@@ -92,8 +92,36 @@ def load_service(name: str, text: str) -> Definition[Any, Any]:
         raise UsageError(f"{text}: {error}") from error
 
 
+def load_interface(text: str) -> tuple[str, list[type[r2p.Message]]] | None:
+    """Return the name in ROS 2 and the classes of the parts of a service or an action; None for another text.
+
+    Raises UsageError.
+    """
+    if ":" not in text:
+        return None
+    where, _, name = text.rpartition(":")
+    found = getattr(load_module(where), name, None)
+    try:
+        if hasattr(found, "Goal"):
+            from r2p.ros.action_types import action_types  # only here, as it takes a while
+
+            types = action_types(found)
+            return types.name.replace("/", "/action/"), [types.goal, types.result, types.feedback]
+        if hasattr(found, "Request") and hasattr(found, "Response"):
+            from r2p.ros.service_types import ros2_service_name, service_shape
+
+            definition = define("service", found)
+            shape = service_shape(definition.requests, definition.responses)
+            return ros2_service_name(shape.name), [definition.request.cls, definition.response.cls]
+    except r2p.MessageError as error:
+        raise UsageError(f"{text}: {error}") from error
+    return None
+
+
 def _find_service(text: str) -> Any:
     """Return the class with nested classes Request and Response, if the text names one."""
+    if text.startswith("std_srvs/"):
+        text = f"r2p.ros.std_srvs:{text.rpartition('/')[2]}"
     where, _, name = (text if ":" in text else f"{STANDARD}:{text}").rpartition(":")
     found = getattr(load_module(where), name, None)
     return found if hasattr(found, "Request") and hasattr(found, "Response") else None

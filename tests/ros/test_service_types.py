@@ -9,8 +9,10 @@ from r2p.messages import message_type
 from r2p.ros import std_srvs
 from r2p.ros.action_types import Action, CancelGoal, GoalState, GoalStatusArray, action_types
 from r2p.ros.classes import RosTypes
-from r2p.ros.definitions import parse_action
+from r2p.ros.definitions import parse_action, service_md5
+from r2p.ros.hashes import TypeDescriptions
 from r2p.ros.library import DefinitionFile, ros2_hash
+from r2p.ros.packages import Interface, packages
 from r2p.ros.service_types import ServiceShape, service_shape, service_type
 from r2p.ros.source import source_of_parts
 from r2p.services.definition import Definition, define
@@ -19,6 +21,12 @@ from tests.ros.recorded import definitions, recorded
 SUMS = {case["type"]: case["md5"] for case in recorded(1)["services"]}
 HASHES = {case["type"]: case["hash"] for case in recorded(2)["service_hashes"]}
 FIBONACCI = recorded(2)["action_hashes"][0]
+
+
+class Point(r2p.Message, name="geometry_msgs/Point32"):
+    x: r2p.f32 = 0.0
+    y: r2p.f32 = 0.0
+    z: r2p.f32 = 0.0
 
 
 class Fibonacci(Action, name="test_msgs/Fibonacci"):
@@ -132,3 +140,38 @@ def test_names() -> None:
         action_types(type("Half", (Action,), {"Goal": Fibonacci.Goal}))
     with pytest.raises(r2p.MessageError, match="is not the type of a service's topic"):
         service_shape(r2p.layout(r2p.msg.Header), r2p.layout(r2p.msg.Header))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_packages_with_services_and_actions(tmp_path: Any, version: int) -> None:
+    """What is read from their files has the sums and hashes of the classes."""
+
+    class Home(r2p.Service, name="arm_msgs/Home"):
+        class Request(r2p.Message):
+            point: Point = Point()
+
+        class Response(r2p.Message):
+            angle: r2p.f32 = 0.0
+
+    interfaces: list[Interface] = [("arm_msgs/srv/Home", [Home.Request, Home.Response])]
+    if version == 2:
+        types = action_types(Fibonacci)
+        interfaces.append(("test_msgs/action/Fibonacci", [types.goal, types.result, types.feedback]))
+    files = packages([], version, interfaces)
+    assert "geometry_msgs" not in " ".join(files)
+    assert "geometry_msgs" in files["arm_msgs/package.xml"]
+    assert '"srv/Home.srv"' in files["arm_msgs/CMakeLists.txt"] or version == 1
+    for path, text in files.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text)
+    names, found = DefinitionFile(tmp_path / "arm_msgs" / "srv" / "Home.srv").read(version)
+    if version == 1:
+        assert service_md5(names[0], names[1], found) == service_type(shape_of(Home), 1).checksum
+        with pytest.raises(r2p.MessageError, match="the actions of ROS 1 are others"):
+            packages([], 1, [("test_msgs/action/Fibonacci", [])])
+    else:
+        descriptions = TypeDescriptions(found)
+        descriptions.add_service("arm_msgs/srv/Home", *(found[name].fields for name in names))
+        assert descriptions.hash("arm_msgs/srv/Home") == service_type(shape_of(Home), 2).checksum
+        assert files["test_msgs/action/Fibonacci.action"] == FIBONACCI["definition"]
+        assert "<depend>action_msgs</depend>" in files["test_msgs/package.xml"]
