@@ -1,6 +1,7 @@
 """The ROS nodes that zenoh's liveliness tokens show, with their publishers, subscribers and servers."""
 
 from collections.abc import Iterable
+from typing import Any
 
 from r2p.errors import DecodeError
 from r2p.ros.middleware import RosGraph, RosPeerEndpoint, RosPeerServer
@@ -28,6 +29,8 @@ class TokenGraph:
         self._session = session
         self._lost = lost
         self._tokens: dict[str, RmwToken] = {}
+        self._peers: dict[EntityKind, dict[str, Any]] = {kind: {} for kind in EntityKind}
+        """What the graph has of each token, by its key."""
         self._by_name: dict[tuple[EntityKind, str], dict[str, RmwToken]] = {}
         self._by_gid: dict[bytes, RmwToken] = {}
 
@@ -49,6 +52,7 @@ class TokenGraph:
             self._lost["too many tokens"] += 1
             return None
         self._tokens[key] = token
+        self._peers[token.kind][key] = _peer(key, token)
         self.version += 1
         if token.kind != EntityKind.NODE:
             self._by_name.setdefault((token.kind, token.name), {})[key] = token
@@ -59,7 +63,10 @@ class TokenGraph:
         """Forget a token, and return it; None for an unknown one."""
         self.version += 1
         token = self._tokens.pop(key, None)
-        if token is None or token.kind == EntityKind.NODE:
+        if token is None:
+            return None
+        del self._peers[token.kind][key]
+        if token.kind == EntityKind.NODE:
             return token
         del self._by_gid[gid_of(key)]
         index = token.kind, token.name
@@ -74,6 +81,8 @@ class TokenGraph:
         self._tokens.clear()
         self._by_name.clear()
         self._by_gid.clear()
+        for each in self._peers.values():
+            each.clear()
 
     def endpoints(self, kind: EntityKind, name: str) -> Iterable[RmwToken]:
         """Return the endpoints of this kind on a topic, or for a service."""
@@ -92,20 +101,21 @@ class TokenGraph:
 
     def snapshot(self) -> RosGraph:
         """Return the graph."""
-        publishers, subscribers, servers, nodes = set(), set(), set(), set()
-        for key, token in self._tokens.items():
-            nodes.add(token.node)
-            if token.kind == EntityKind.PUBLISHER:
-                publishers.add(_endpoint(key, token))
-            elif token.kind == EntityKind.SUBSCRIBER:
-                subscribers.add(_endpoint(key, token))
-            elif token.kind == EntityKind.SERVER:
-                servers.add(RosPeerServer(token.node, token.name, ros_type(token.type), token.checksum))
-        return RosGraph(frozenset(nodes), frozenset(publishers), frozenset(subscribers), frozenset(servers))
+        nodes = frozenset([each.node for each in self._tokens.values()])
+        kinds = EntityKind.PUBLISHER, EntityKind.SUBSCRIBER, EntityKind.SERVER
+        return RosGraph(nodes, *[frozenset(self._peers[kind].values()) for kind in kinds])
 
 
-def _endpoint(key: str, token: RmwToken) -> RosPeerEndpoint:
-    return RosPeerEndpoint(token.node, token.name, ros_type(token.type), token.checksum, token.qos, gid_of(key))
+def _peer(key: str, token: RmwToken) -> Any:
+    """Return what the graph has of a token."""
+    match token.kind:
+        case EntityKind.PUBLISHER | EntityKind.SUBSCRIBER:
+            name = ros_type(token.type)
+            return RosPeerEndpoint(token.node, token.name, name, token.checksum, token.qos, gid_of(key))
+        case EntityKind.SERVER:
+            return RosPeerServer(token.node, token.name, ros_type(token.type), token.checksum)
+        case _:
+            return None
 
 
 def explain_mismatch(own: RmwToken, other: RmwToken) -> str:

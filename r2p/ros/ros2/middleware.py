@@ -133,16 +133,19 @@ class Ros2Middleware(Middleware):
         session, self._session = self._session, None
         if self._matches is not None:
             self._matches.on_down()
-        if session is not None:
-            for closing in (self._advertised, self._subscriptions, self._served, self._clients):
-                for each in closing.values():
-                    if each is not None:
-                        self.lost.guard(each.close)
-            for node in self._nodes:
-                session.remove_node(node)
-            await session.close()
-        else:
+        if session is None:
             await zenoh_session.close()
+            return
+        opened = self._advertised, self._subscriptions, self._served, self._clients
+        for each in [each for table in opened for each in table.values() if each is not None]:
+            self.lost.guard(each.close)
+        self._advertised = dict.fromkeys(self._advertised)
+        self._served = dict.fromkeys(self._served)
+        for table in (self._publishers, self._subscriptions, self._clients):
+            table.clear()
+        for node in self._nodes:
+            session.remove_node(node)
+        await session.close()
 
     def _on_transport(self, change: tuple[str, bool, bool]) -> None:
         other, opened, _ = change

@@ -83,7 +83,8 @@ def zenoh_config(options: Ros2Options) -> "zenoh.Config":
         _insert(config, {key: value for key, value in options.overrides.items() if key not in chosen})
         if options.zenoh.mode == "client":  # rmw_zenoh's file also makes a session listen
             _insert(config, {"listen/endpoints": "[]"})
-        if not connection_settings(config).endpoints:
+        may_be_alone = options.zenoh.mode == "peer" and options.zenoh.config is not None
+        if not connection_settings(config).endpoints and not may_be_alone:
             _insert(config, {"connect/endpoints": json.dumps([DEFAULT_ENDPOINT])})
     except zenoh.ZError as error:
         raise options.error(f"ZENOH_CONFIG_OVERRIDE: zenoh rejects this: {plain_text(error)}") from error

@@ -230,7 +230,6 @@ class RmwClient:
                     payload=bytes(request),
                     attachment=attachment,
                     timeout=min(timeout + 1.0, _LONGEST_S),
-                    priority=zenoh.Priority.INTERACTIVE_HIGH,
                     congestion_control=zenoh.CongestionControl.BLOCK,  # as in rmw_zenoh: routers drop no request then
                     express=True,
                     allowed_destination=zenoh.Locality.REMOTE,

@@ -1,6 +1,7 @@
 """Two r2p programs on one ROS 2 network, and a gateway to it: what links of r2p do by themselves works there, too."""
 
 import asyncio
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +10,7 @@ from r2p.msg import String
 from r2p.ros.std_srvs import SetBool
 from r2p.testing.network import node_in
 from r2p.transports.url import open_transport
+from tests.ports import free_port
 from tests.ros.ros2.network import GUARD, RouterOfTests, router
 from tests.services.common import until
 
@@ -66,6 +68,23 @@ async def test_domains(monkeypatch: pytest.MonkeyPatch) -> None:
             "no other ROS node is on domain 0, but there are nodes on domain 7: is ?domain=7 (or ROS_DOMAIN_ID) meant?"
         )
         assert not publisher.subscribers
+
+
+async def test_peers_without_a_router(tmp_path: Path) -> None:
+    """One listens, as its file says, and is up alone; the other one connects."""
+    port, path = free_port(), tmp_path / "peer.json5"
+    path.write_text(f'{{listen: {{endpoints: ["tcp/127.0.0.1:{port}"]}}, scouting: {{multicast: {{enabled: false}}}}}}')
+    async with (
+        asyncio.timeout(GUARD),
+        r2p.Module("ONE", via=f"ros2:?mode=peer&config={path}", watchdog=False) as one,
+        r2p.Module("TWO", via=f"ros2:tcp/127.0.0.1:{port}?mode=peer", watchdog=False) as two,
+        node_in(one, name="a") as a,
+        node_in(two, name="b") as b,
+    ):
+        publisher, subscriber = a.advertise("numbers", String), b.subscribe("numbers", String)
+        await publisher.wait_subscriber()
+        await publisher.publish(String(data="direct"))
+        assert (await subscriber.fetch()).data == "direct"
 
 
 def test_urls() -> None:

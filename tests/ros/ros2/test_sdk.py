@@ -78,3 +78,10 @@ async def test_services() -> None:
         assert await peer.ask("call", "/enable", "sdk_caller", True) == [True, "now True"]
         assert asked == [False, True]
         assert peer.asked == [["/sdk/enable", True]]
+        # It is killed: its service is gone at once, and r2p's own goes on.
+        await peer.kill()
+        await until(lambda: not client.servers)
+        with pytest.raises(r2p.NoServer):
+            await client.call(SetBool.Request(data=True))
+        async with sdk_peer(network.port) as again:
+            assert await again.ask("call", "/enable", "sdk_caller", True) == [True, "now True"]
