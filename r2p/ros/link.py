@@ -114,6 +114,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         )
         self.services = RosServices(self, hub, self._ros, self._registrations)
         self._published: dict[str, _Published] = {}
+        self._travels: dict[str, RosTopic] = {}
         self._subscribed: dict[str, RosTopic] = {}
         self._by_ros_name: dict[str, str] = {}
         self._found: dict[str, set[str]] = {}
@@ -157,6 +158,7 @@ class RosLink(BufferedLink, MiddlewareUser):
             self._learn_type(topic)
             return
         self._by_ros_name[name] = topic
+        self._travels[topic] = travel
         self._publish(topic, name, travel if publishes else None)
         self._subscribe(topic, name, travel if subscribes else None)
         self._ros.set_type(topic, _topic_type(travel))
@@ -188,9 +190,13 @@ class RosLink(BufferedLink, MiddlewareUser):
         types = frozenset(each.type for each in peers if each.type)
         try:
             find = functools.partial(self._types.find, topic, cls, types)
-            return self._background.get(topic, (topic, cls, types), find), ""
+            found = self._background.get(topic, (topic, cls, types), find)
         except MessageError as error:
             return None, str(error)
+        if found is None:  # not yet: until then as before, if it is registered, so that nothing is lost
+            last = self._travels.get(topic)
+            found = last if last is not None and last.shape.cls is cls else None
+        return found, ""
 
     def class_of(self, topic: str, peers: Sequence[RosPeerEndpoint] = ()) -> type[Message] | None:
         """Return the class of a topic that has these publishers and subscribers in other ROS nodes; None if unknown."""
@@ -209,6 +215,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._ros.set_type(topic, None if cls is None else _class_type(cls))
 
     def _remove(self, topic: str) -> None:
+        self._travels.pop(topic, None)
         self._published.pop(topic, None)
         self._subscribed.pop(topic, None)
         for role in _ROLES:

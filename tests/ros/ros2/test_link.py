@@ -7,6 +7,8 @@ import pytest
 
 import r2p
 from r2p.msg import String
+from r2p.ros.link import RosLink
+from r2p.ros.ros2.middleware import Ros2Middleware
 from r2p.ros.std_srvs import SetBool
 from r2p.testing.network import node_in
 from r2p.transports.url import open_transport
@@ -21,6 +23,13 @@ def module(network: RouterOfTests, name: str, options: str = "") -> r2p.Module:
     return r2p.Module(name, via=f"ros2:{network.endpoint}{options}", watchdog=False)
 
 
+def ros_publisher(module: r2p.Module, topic: str) -> object:
+    link = module.links[0]
+    assert isinstance(link, RosLink)
+    assert isinstance(link.middleware, Ros2Middleware)
+    return link.middleware._publishers.get(("/a", topic))
+
+
 async def test_two_programs() -> None:
     """Messages, a latched value for a later subscriber, and calls; the router is lost in between."""
     async with asyncio.timeout(GUARD), router() as network, module(network, "ONE") as one, node_in(one, name="a") as a:
@@ -32,10 +41,14 @@ async def test_two_programs() -> None:
             return SetBool.Response(success=request.data)
 
         a.serve("enable", SetBool, enable)
+        await until(lambda: ros_publisher(one, "/numbers"))
+        registered = ros_publisher(one, "/numbers")
         async with module(network, "TWO") as two, node_in(two, name="b") as b:
             assert (await b.subscribe("state", String).fetch()).data == "new"
             received = b.subscribe("numbers", String, queue=100)
             client = b.client("enable", SetBool)
+            await numbers.wait_subscriber()
+            assert ros_publisher(one, "/numbers") is registered  # the type of the subscriber has changed nothing
             for _ in range(2):
                 await numbers.wait_subscriber()
                 await received.wait_publisher()
