@@ -5,14 +5,14 @@ programs take part: real sockets and devices work, and ROS nodes that follow its
 other programs do there: it shows the time that it is given, and stands still in between.
 """
 
-import logging
 from collections.abc import Callable
 from typing import Final
 
 from r2p.clock import SystemClock
+from r2p.log_lines import LineLimit, get_logger
 from r2p.units import SECOND
 
-logger = logging.getLogger("r2p.clock")
+logger = get_logger("r2p.clock")
 
 _SYSTEM: Final = SystemClock()
 _EPOCH: Final = 1_356_998_400 * SECOND  # 2013-01-01T00:00:00Z
@@ -20,6 +20,7 @@ _LAG: Final = (
     SECOND // 10
 )  # ns of real time by which a paced clock may be late, and makes up for it; what is more is lost
 _LOOK_EVERY: Final = 0.5  # s of real time between two looks whether the clock that is followed is still there
+_REORDERED: Final = SECOND // 2  # ns by which a time may be older than the one before, and is left out
 _JUMP: Final = 10 * SECOND  # by which a clock may go on at once, with all timers until then; beyond it is set anew
 
 
@@ -94,15 +95,22 @@ class FollowingClock(PacedClock):
         self.epoch = _SYSTEM.now()
         self._followed: int | None = None
         self._alive: Callable[[], bool] = bool
+        self._lines = LineLimit(1)
 
     def follow(self, utc: int, alive: Callable[[], bool]) -> None:
         """Go on to this time (ns since 1970); with real time as soon as `alive()` is false: the other clock is gone."""
-        elapsed = utc - self.epoch
-        if self._followed is None or not 0 <= elapsed - self.elapsed <= _JUMP:
-            jump = elapsed - self.elapsed
-            logger.info("the time is now that of /clock, which is %+.1f s from here", jump / SECOND)
-            self.epoch, elapsed = utc - self.elapsed, self.elapsed
-        self._followed, self._alive = elapsed, alive
+        self._alive = alive
+        step = utc - self.now()
+        if self._followed is not None and -_REORDERED < step <= _JUMP:
+            self._followed = max(self._followed, utc - self.epoch)
+            return
+        more = self._lines.suffix("jump", self._real())
+        if more is not None:
+            before = (
+                f"goes from {self.now() / SECOND:.1f} s to" if self._followed is not None else "is followed: it is now"
+            )
+            logger.info("the time of /clock %s %.1f s%s", before, utc / SECOND, more)
+        self.epoch, self._followed = utc - self.elapsed, self.elapsed
 
     def release(self) -> None:
         """Go on with real time."""

@@ -122,15 +122,28 @@ async def _turns() -> None:
         await asyncio.sleep(0)
 
 
-def test_a_clock_that_goes_back_or_far_ahead_runs_no_timers() -> None:
+def test_a_clock_that_goes_back_or_far_ahead_runs_no_timers(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
     clock = FollowingClock(Real())
     for time in (SIMULATED, SIMULATED - 50 * SECOND, SIMULATED + 900 * SECOND, 0):
         clock.follow(time, lambda: True)
         clock.advance(1000 * SECOND)
         assert (clock.now(), clock.elapsed) == (time, 0)
-    clock.follow(SECOND, lambda: True)
-    clock.advance(1000 * SECOND)
-    assert (clock.now(), clock.elapsed) == (SECOND, SECOND)
+    for time in (SECOND, SECOND - 1):  # the second one was overtaken
+        clock.follow(time, lambda: True)
+        clock.advance(1000 * SECOND)
+        assert (clock.now(), clock.elapsed) == (SECOND, SECOND)
+    assert caplog.messages == ["the time of /clock is followed: it is now 100.0 s"]  # and later ones are too many
+
+
+def test_jumps_are_logged(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    real = Real()
+    clock = FollowingClock(real)
+    for time in (SIMULATED, 0):
+        clock.follow(time, lambda: True)
+        real.time += 2 * SECOND
+    assert caplog.messages[1:] == ["the time of /clock goes from 100.0 s to 0.0 s"]
 
 
 @pytest.mark.parametrize(
