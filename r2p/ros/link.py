@@ -52,7 +52,7 @@ from r2p.ros.registrations import Registrations
 from r2p.ros.services import RosServices, ServiceArrival
 from r2p.ros.topic_classes import TopicClasses
 from r2p.ros.topics import RosTopic, TopicTypes, is_own, ros_type
-from r2p.runtime.sample import Sample, Source
+from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.link import Hub, Transport, unique_name
@@ -187,6 +187,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         if cls is None:
             is_waiting = not peers and self._elsewhere(topic) == _NOTHING  # for a publisher: nothing is wrong yet
             return None, "" if is_waiting else _UNKNOWN
+        if misfit := self._misfit(topic, cls):
+            return None, misfit
         types = frozenset(each.type for each in peers if each.type)
         try:
             find = functools.partial(self._types.find, topic, cls, types)
@@ -197,6 +199,15 @@ class RosLink(BufferedLink, MiddlewareUser):
             last = self._travels.get(topic)
             found = last if last is not None and last.shape.cls is cls else None
         return found, ""
+
+    def _misfit(self, topic: str, cls: type[Message]) -> str:
+        """Return how a class differs from the messages on a gateway's other links; empty if it does not."""
+        published, asked = self._elsewhere(topic)
+        theirs, ours = published if published != TopicType() else asked, _class_type(cls)
+        if ours.fits(theirs):
+            return ""
+        sizes = f" has {ours.size} bytes, messages of others {theirs.size}" if ours.size != theirs.size else " differs"
+        return f"{layout(cls).name}{sizes}: give another type"
 
     def class_of(self, topic: str, peers: Sequence[RosPeerEndpoint] = ()) -> type[Message] | None:
         """Return the class of a topic that has these publishers and subscribers in other ROS nodes; None if unknown."""
@@ -298,6 +309,10 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.stats.lost[_NOT_ON_ROS] += 1
         advice = f": give --type {topic}=TYPE" if reason == _UNKNOWN else ""
         self.notice(_NOT_ON_ROS, f"{topic} is not on ROS: {reason}{advice}", trouble=False)
+
+    def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
+        waits = ", waits for room" if publisher_class is PublisherClass.NON_REAL_TIME else ""
+        return f"reliable to ROS nodes that keep up, in order{waits}"
 
     def not_carried(self) -> dict[str, str]:
         return self.off_ros | self.services.off_ros
@@ -475,9 +490,6 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
         return self.services.requested(service, request, answer, refuse)
-
-    def parameter_changed(self, key: str, value: object) -> None:
-        """Do nothing yet."""
 
     def notice(self, kind: str, text: str, *, trouble: bool) -> None:
         self._hub.link_notice(self, kind, text, trouble=trouble)

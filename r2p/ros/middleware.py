@@ -167,9 +167,6 @@ class MiddlewareUser(Protocol):
     def made_room(self) -> None:
         """Go on sending: `Middleware.full` was true, and is not any more."""
 
-    def parameter_changed(self, key: str, value: object) -> None:
-        """Note a change on ROS 1's parameter server below a key that was subscribed; None: deleted."""
-
     def notice(self, kind: str, text: str, *, trouble: bool) -> None:
         """Report something to the user, in words that say what to do, once for each `kind`."""
 

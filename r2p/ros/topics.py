@@ -130,7 +130,7 @@ class TopicTypes:
         shape = layout(cls)
         stamps = _HeaderStamps(shape, self._counts) if _has_header(shape) else None
         if self.version == 1:
-            return RosTopic(shape, kind, _packed(stamps), _unpacked(shape))
+            return RosTopic(shape, kind, _packed(shape, stamps), _unpacked(shape))
         return RosTopic(shape, kind, _to_cdr(theirs, stamps), _from_cdr(shape, theirs))
 
     def _converted(self, found: Conversion) -> RosTopic:
@@ -202,10 +202,25 @@ class _HeaderStamps:
         return msgspec.structs.replace(message, header=header)
 
 
-def _packed(stamps: _HeaderStamps | None) -> Callable[[Sample], Sequence[bytes]]:
+def _packed(shape: Layout[Any], stamps: _HeaderStamps | None) -> Callable[[Sample], Sequence[bytes]]:
+    if shape.exact_size:  # it has no header with a stamp: there is a text in that
+        return _fixed(b"", shape.exact_size)
+
     def encode(sample: Sample) -> Sequence[bytes]:
         message = None if stamps is None else stamps.filled(sample)
         return (sample.data if message is None else message.encode(),)
+
+    return encode
+
+
+def _fixed(header: bytes, size: int) -> Callable[[Sample], Sequence[bytes]]:
+    """Return a function that puts a header before the packed bytes, which are those of ROS."""
+
+    def encode(sample: Sample) -> Sequence[bytes]:
+        data = sample.data
+        if len(data) != size:  # of another module, which has not announced its type
+            raise DecodeError(f"{len(data)} bytes are not {size}")
+        return (header + data if header else data,)
 
     return encode
 
@@ -224,8 +239,8 @@ def _unpacked(shape: Layout[Any]) -> Callable[[bytes], Decoded]:
 
 def _to_cdr(theirs: type[Message], stamps: _HeaderStamps | None) -> Callable[[Sample], Sequence[bytes]]:
     pack, decode = cdr(theirs).encode, layout(theirs).decode
-    if packed_size(theirs):  # it has no header with a stamp: there is a text in that
-        return lambda sample: (HEADER + sample.data,)
+    if size := packed_size(theirs):  # it has no header with a stamp: there is a text in that
+        return _fixed(HEADER, size)
 
     def encode(sample: Sample) -> Sequence[bytes]:
         filled = None if stamps is None else stamps.filled(sample)

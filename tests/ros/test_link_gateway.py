@@ -57,7 +57,12 @@ async def test_a_topic_of_unknown_type_is_listed_and_the_option_helps(
     version: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    for options, expected in (({}, {"raw": "type unknown"}), ({"types": {"raw": Speed}}, {})):
+    wrong = "r2p_msgs/Float32 has 4 bytes, messages of others 9: give another type"
+    for options, expected in (
+        ({}, {"raw": "type unknown"}),
+        ({"types": {"raw": Speed}}, {}),
+        ({"types": {"ra?": Float32}}, {"raw": wrong}),
+    ):
         network, bus = FakeRosNetwork(version), Network()
         received = network.node("/user").subscribe("/raw", Speed)
         async with gateway("GW", bus, network, **options) as module, bus.node("BASE") as base:

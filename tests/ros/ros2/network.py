@@ -98,8 +98,6 @@ class Recorder(MiddlewareUser):
     def made_room(self) -> None:
         self._note("room")
 
-    def parameter_changed(self, key: str, value: object) -> None: ...
-
     def notice(self, kind: str, text: str, *, trouble: bool) -> None:
         self.notices.append(text)
         self._changed.set()
