@@ -16,6 +16,7 @@ topics        how topics travel; topic_classes, graph_names, qos, options: their
 middleware    the seam to ROS 1, rmw_zenoh or DDS
 service_types   types of services in ROS; std_srvs: those that every ROS has
 services        services between r2p and ROS nodes; service_calls: from a request to its answer
+exposed_parameters   parameters of this module and of those behind a gateway; parameters: those of ROS 2's nodes
 action_types    types of actions; action_server and action_client: the two ends
 """
 

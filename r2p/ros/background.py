@@ -46,6 +46,10 @@ class BackgroundResults:
             raise found.with_traceback(None)
         return cast("T", found)
 
+    def is_pending(self, topic: str) -> bool:
+        """Return whether a result for a topic is being computed."""
+        return any(topic in topics for topics in self._waiting.values())
+
     def close(self) -> None:
         """Stop: what is being computed is not used."""
         self._closed = True

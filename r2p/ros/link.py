@@ -113,6 +113,8 @@ class RosLink(BufferedLink, MiddlewareUser):
             middleware, module_node, hub.space.loop, lambda: self._touch(LOG), at_once=hub.observer
         )
         self.services = RosServices(self, hub, self._ros, self._registrations)
+        self.own_servers: dict[str, Callable[[bytes, Answer, Refuse], Cancel]] = {}
+        """What handles requests for services that ROS's nodes have and r2p's have not, by their names in ROS."""
         self._published: dict[str, _Published] = {}
         self._travels: dict[str, RosTopic] = {}
         self._subscribed: dict[str, RosTopic] = {}
@@ -153,6 +155,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         name = self.names.to_ros(topic)
         travel, reason = self._travel(topic, name) if publishes or subscribes else (None, "")
         self._note_off_ros(topic, reason)
+        if travel is None and not reason and (publishes or subscribes) and self._background.is_pending(topic):
+            return  # until it is known, it stays as it is: other nodes are connected
         if travel is None or name is None:
             self._remove(topic)
             self._learn_type(topic)
@@ -261,6 +265,7 @@ class RosLink(BufferedLink, MiddlewareUser):
     def _subscribe(self, topic: str, name: str, travel: RosTopic | None) -> None:
         if travel is None:
             self._subscribed.pop(topic, None)
+            self._found.pop(topic, None)
             self._registrations.declare(topic, ROLE_SUBSCRIBES, set())
             return
         self._subscribed[topic] = travel
@@ -445,6 +450,7 @@ class RosLink(BufferedLink, MiddlewareUser):
     def middleware_down(self, reason: str) -> None:
         self.services.graph_with_services(RosGraph())
         self._found.clear()
+        self._latched.clear()
         self.on_down(reason)
 
     def middleware_waits(self, reason: str) -> None:
@@ -488,7 +494,15 @@ class RosLink(BufferedLink, MiddlewareUser):
     def received(self, messages: list[RosArrival]) -> None:
         self.receive(messages)
 
+    @property
+    def registrations(self) -> Registrations:
+        """Return the ROS nodes of this link, and what they have."""
+        return self._registrations
+
     def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
+        own = self.own_servers.get(service)
+        if own is not None:
+            return own(request, answer, refuse)
         return self.services.requested(service, request, answer, refuse)
 
     def notice(self, kind: str, text: str, *, trouble: bool) -> None:

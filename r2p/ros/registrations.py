@@ -63,6 +63,8 @@ class Registrations:
         self._counts: Counter[str] = Counter()
         self.refused: set[str] = set()
         """Nodes that are not shown, as others have their names."""
+        self._shown: Callable[[str], object] = _do_nothing
+        self._gone: Callable[[str], object] = _do_nothing
         self._at_once = self._alone = at_once
         self._clock = clock_of(loop)
         self._alarm = Alarm(loop, self._show_module_node, background=True)
@@ -93,6 +95,12 @@ class Registrations:
             self._endpoints[name, role] = wanted
         else:
             self._endpoints.pop((name, role), None)
+
+    def watch(self, shown: Callable[[str], object], gone: Callable[[str], object]) -> None:
+        """Call `shown` with each node, now and when a new one is shown, and `gone` before a node is removed."""
+        self._shown, self._gone = shown, gone
+        for node in sorted(self.nodes):
+            shown(node)
 
     @property
     def shows_module_node(self) -> bool:
@@ -146,14 +154,14 @@ class Registrations:
         for node in sorted(self._wanted() - self.nodes):
             self._middleware.add_node(node)
             self.nodes.add(node)
+            self._shown(node)
 
     def _remove_nodes(self) -> None:
-        wanted = self._wanted()
-        for node in sorted(wanted - self.nodes):  # the module's own one, before the last other one goes
-            self._middleware.add_node(node)
-        for node in sorted(self.nodes - wanted):
+        self._add_nodes()  # the module's own one, before the last other one goes
+        for node in sorted(self.nodes - self._wanted()):
+            self._gone(node)
             self._middleware.remove_node(node)
-        self.nodes = wanted
+            self.nodes.remove(node)
 
 
 def _sorted(endpoints: Collection[Registered]) -> list[Registered]:

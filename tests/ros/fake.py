@@ -21,6 +21,7 @@ import msgspec
 from r2p.errors import NoServer, ServiceError
 from r2p.messages import Message, layout
 from r2p.ros.cdr import cdr
+from r2p.ros.classes import definitions_of
 from r2p.ros.link import RosTransport
 from r2p.ros.middleware import (
     Middleware,
@@ -222,6 +223,8 @@ class RosNode(Participant):
     def __init__(self, network: FakeRosNetwork, name: str) -> None:
         self.name = name
         self.network = network
+        self.classes: dict[str, type[Message]] = {}
+        """The classes of its topics, whose definitions it gives to others."""
         self._publishers: dict[str, Port] = {}
         self._subscribers: dict[int, tuple[type[Message] | None, list[Any]]] = {}
         self._handlers: dict[str, Callable[[bytes], Awaitable[bytes]]] = {}
@@ -230,6 +233,7 @@ class RosNode(Participant):
 
     def advertise(self, topic: str, cls: type[Message], qos: Qos = QOS, type: RosType | None = None) -> None:
         """Begin to publish a topic."""
+        self.classes[topic] = cls
         endpoint = RosEndpoint(self.name, topic, type or ros_type(cls, self.network.version), qos)
         self._publishers[topic] = self.network.add(self, endpoint, publishes=True)
 
@@ -323,6 +327,16 @@ class FakeMiddleware(Middleware, Participant):
             self._remove(endpoint, publishes=publishes)
             self._to_register.append((endpoint, publishes))
         self._matches.clear()
+
+    async def describe(self, endpoint: RosPeerEndpoint) -> str:
+        """Ask the node for the definition of its type; a few milliseconds later it has answered."""
+        await asyncio.sleep(0.005)
+        owner = self.network.nodes.get(endpoint.node)
+        cls = owner.classes.get(endpoint.topic) if isinstance(owner, RosNode) else None
+        if cls is None:
+            return ""
+        first, *others = definitions_of(cls, self.version).values()
+        return "".join([first.text, *(f"{'=' * 80}\nMSG: {each.name}\n{each.text}" for each in others)])
 
     # Registrations
 

@@ -4,11 +4,15 @@ import asyncio
 from typing import Annotated, Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import r2p
 from r2p.errors import TransportError
 from r2p.messages import Timestamp
 from r2p.msg import IMU, Header, Log, String, Velocity3
+from r2p.names import TOPIC, module_path, node_name, topic_name
+from r2p.ros.graph_names import GraphNames
 from r2p.ros.link import ros_transport
 from r2p.ros.middleware import Qos, RosType
 from r2p.ros.options import QosChange, RosOptions, namespace, qos_change
@@ -237,6 +241,56 @@ async def test_the_graph_is_shown(version: int) -> None:
     assert learnt is String
     assert "arm/talker" in modules
     assert nodes == {("arm/talker", "talker"): (["arm/state"], [])}
+
+
+class Wheel(r2p.Message, name="robot_msgs/Wheel"):
+    speed: r2p.f32 = 0.0
+
+
+class Base(r2p.Message, name="robot_msgs/Base"):
+    """A type of the user, which does not come with ROS, with another one in it."""
+
+    stamp: Timestamp = Timestamp()
+    wheels: Annotated[tuple[Wheel, ...], r2p.Max(8)] = ()
+    name: Annotated[str, r2p.Max(20)] = ""
+
+
+@both
+@pytest.mark.virtual_time
+async def test_a_type_of_the_user_is_learnt_from_the_node_that_has_it(version: int) -> None:
+    network = FakeRosNetwork(version)
+    talker = network.node("/talker")
+    talker.advertise("/base", Base)
+    async with r2p.Module("PC1", via=network.transport(), observer=True) as module, node_in(module) as node:
+        await asyncio.sleep(1)
+        cls = await module.network.message_type(module.network.topics()["base"].fingerprint or b"")
+        assert cls is not None
+        assert cls is not Base
+        subscriber = node.subscribe("base", cls)
+        await subscriber.wait_publisher()
+        talker.publish("/base", Base(Timestamp(1, 2), (Wheel(3.0), Wheel(4.0)), "left"))
+        message: Any = await subscriber.fetch()
+    assert [each.speed for each in message.wheels] == [3.0, 4.0]
+    assert (message.stamp, message.name) == (Timestamp(1, 2), "left")
+
+
+@given(st.text(max_size=300), st.sampled_from(["", "/robot1", "/a/b"]))
+def test_any_name_of_the_graph_has_a_valid_name_here_or_none(name: str, ns: str) -> None:
+    names = GraphNames(RosOptions(ns=ns))
+    topic = names.from_ros(name)
+    if topic is not None:
+        assert topic_name(topic) == topic or topic[:1].isdecimal() or "/" in topic
+        assert names.to_ros(topic) in (name, None)
+    module, node = names.module(name)
+    assert module_path(module) == module
+    assert node_name(node) == node
+
+
+@given(st.from_regex(TOPIC, fullmatch=True), st.sampled_from(["", "/robot1"]))
+def test_the_name_of_a_topic_comes_back(topic: str, ns: str) -> None:
+    names = GraphNames(RosOptions(ns=ns))
+    there = names.to_ros(topic)
+    assert there is None or names.from_ros(there) == topic
 
 
 HOSTILE = ["", "/", "//", "/a b", "/\x00", "/é", "/a/" + "b" * 300, "no_slash", "/~private", "/R2P", "/x" * 200, "/1"]

@@ -12,14 +12,14 @@ In the order to read it:
 zenoh itself is imported when a session is opened, not before.
 """
 
-from r2p.ros.link import RosTransport
 from r2p.ros.middleware import Middleware
+from r2p.ros.parameters import ParameterTransport
 from r2p.ros.ros2.options import parse_options
 from r2p.transports.link import Hub
 from r2p.transports.url import Url
 
 
-def from_url(url: Url) -> RosTransport:
+def from_url(url: Url) -> ParameterTransport:
     """`ros2:[ENDPOINT]`; `options` has the options. Raises TransportError."""
     options = parse_options(url)
 
@@ -33,4 +33,4 @@ def from_url(url: Url) -> RosTransport:
             raise options.error(f"{missing} is missing: pip install 'r2p[ros]'") from error
         return Ros2Middleware(options, hub.space.clock, hub.random, observer=hub.observer)
 
-    return RosTransport(options.name, make, options.ros)
+    return ParameterTransport(options.name, make, options.ros)
