@@ -8,6 +8,7 @@ body, and go out by `send(topic, data, lifetime)`.
 """
 
 import asyncio
+from collections import Counter
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -29,10 +30,9 @@ OPEN_MAX = 1024
 UNKNOWN_LIFETIME = 10 * SECOND
 """Ns: the time-out of a caller whose link does not carry it."""
 
-_REPEAT = (
-    SECOND  # ns after which a request is sent to r2p again, by a link that may lose it; then 1.5 times as long ...
-)
-_REPEAT_MAX = 10 * SECOND  # ... up to this
+_TOO_MANY = "too many calls"
+_REPEAT = SECOND  # ns after which a request is sent to r2p again, unless its server is here; then 1.5 times as long
+_REPEAT_MAX = 10 * SECOND
 _CANCEL_PAUSE = 250 * MILLISECOND  # ns between two cancellations
 _CANCELS = 4  # that are sent without an answer
 _TEXT_MAX = 1000  # bytes of an error's text
@@ -89,12 +89,14 @@ class RosCalls:
         clock: Clock,
         send: Send,
         report: Callable[[CarriedService, str], None],
+        lost: Counter[str],
     ) -> None:
         self._middleware = middleware
         self._loop = loop
         self._clock = clock
         self._send = send
         self._report = report
+        self._lost = lost
         self._open: dict[tuple[str, int, int], asyncio.Task[None]] = {}
         self._answers: dict[str, RememberedAnswers] = {}
 
@@ -119,11 +121,13 @@ class RosCalls:
 
     def _begin(self, service: CarriedService, header: ServiceHeader, body: bytes, given: int, left: int) -> None:
         if len(self._open) >= OPEN_MAX:
+            self._lost[_TOO_MANY] += 1
             self._answer(service, header, Kind.BUSY, b"", given)
             return
         try:
             request = service.codec.request_to_ros(body)
         except (DecodeError, MessageError) as error:
+            self._lost["undecodable"] += 1
             self._answer(service, header, Kind.ERROR, str(error).encode(), given)
             return
         key = service.name, header.instance, header.number
@@ -142,6 +146,7 @@ class RosCalls:
         except TimeoutError:
             data = f"no answer within {given / SECOND:g} s".encode()
         except (DecodeError, MessageError) as error:
+            self._lost["undecodable"] += 1
             data = f"its answer is not usable: {error}".encode()
         except Error as error:
             data = str(error).encode(errors="replace")
@@ -187,8 +192,11 @@ class RosRequests:
     `instance` stands for all ROS nodes in the headers: each server remembers what it has answered to it.
     """
 
-    def __init__(self, instance: int, loop: asyncio.AbstractEventLoop, clock: Clock, send: Send) -> None:
+    def __init__(
+        self, instance: int, loop: asyncio.AbstractEventLoop, clock: Clock, send: Send, lost: Counter[str]
+    ) -> None:
         self.instance = instance
+        self._lost = lost
         self._clock = clock
         self._send = send
         self._open: dict[tuple[str, int], _OpenRequest] = {}
@@ -198,11 +206,13 @@ class RosRequests:
     def begin(self, service: CarriedService, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
         """Send a request to the server; return the function that cancels it."""
         if len(self._open) >= OPEN_MAX:
+            self._lost[_TOO_MANY] += 1
             refuse(f"{OPEN_MAX} requests wait for their answers: call again later")
             return _nothing_to_cancel
         try:
             body = service.codec.request_from_ros(request)
         except (DecodeError, MessageError) as error:
+            self._lost["undecodable"] += 1
             refuse(str(error))
             return _nothing_to_cancel
         number = self._next_number(service.name)
@@ -228,6 +238,7 @@ class RosRequests:
         try:
             data = request.service.codec.response_to_ros(body)
         except (DecodeError, MessageError) as error:
+            self._lost["undecodable"] += 1
             request.refuse(f"its answer is not usable: {error}")
         else:
             request.answer(data)

@@ -94,8 +94,9 @@ class RosServices:
         self._discovery = discovery
         self._registrations = registrations
         loop, clock = hub.space.loop, hub.space.clock
-        self._calls = RosCalls(link.middleware, loop, clock, self._deliver, self._report)
-        self._requests = RosRequests(hub.random.getrandbits(32) | 1, loop, clock, self._deliver)
+        lost = discovery.counts
+        self._calls = RosCalls(link.middleware, loop, clock, self._deliver, self._report, lost)
+        self._requests = RosRequests(hub.random.getrandbits(32) | 1, loop, clock, self._deliver, lost)
         self._carried: dict[str, CarriedService] = {}
         self._by_ros_name: dict[str, CarriedService] = {}
         self._graph = RosGraph()

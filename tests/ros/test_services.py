@@ -133,6 +133,7 @@ async def test_a_ros_node_calls_a_server(version: int) -> None:
         answers = await asyncio.gather(*(peer.call("/math/divide", Divide.Request(float(n))) for n in range(60)))
         assert [answer.quotient for answer in answers] == list(range(60))
         assert server.handled == 62
+        assert module.links[0].losses["undecodable"] == 1
         assert server.repeated == 0
         server.close()
         await asyncio.sleep(0.1)
@@ -296,3 +297,21 @@ async def test_tools_know_the_services_that_every_ros_has() -> None:
         fingerprint = r2p.layout(define("enable", SetBool).requests.cls).fingerprint
         assert view.fingerprint == fingerprint
         assert await module.links[0].message_type(fingerprint) is not None
+
+
+@pytest.mark.virtual_time
+async def test_a_flood_of_calls_is_refused_and_counted() -> None:
+    network = FakeRosNetwork(2)
+    peer = Peer(network.node("/caller"), Trigger)
+
+    async def slow(request: Trigger.Request) -> Trigger.Response:
+        await asyncio.sleep(60)
+        return Trigger.Response()
+
+    async with r2p.Module("PC1", via=network.transport()) as module, node_in(module) as node:
+        node.serve("slow", Trigger, slow, limit=2000)
+        await asyncio.sleep(0.1)
+        calls = [asyncio.create_task(peer.call("/slow", Trigger.Request())) for _ in range(1100)]
+        errors = [each for each in await asyncio.gather(*calls, return_exceptions=True) if isinstance(each, Exception)]
+        assert {str(each) for each in errors} == {"1024 requests wait for their answers: call again later"}
+        assert len(errors) == module.links[0].losses["too many calls"] == 76
