@@ -107,15 +107,15 @@ def _into(cls: type[Message], from_ros: FromRos) -> FromRos:
     return lambda message: cls.decode(from_ros(message).encode())
 
 
-_PLANE = "z, roll and pitch, and their rates"
-_NO_STAMP = "the stamp, which is that of the sample"
-_COVARIANCES = "covariances"
 _IMU = "accelerations and covariances"
 _FROM_IMU = "accelerations, covariances; without an orientation the angles are NaN"
 _ODOMETRY = "covariances, which are 0: unknown"
-_GPS = "speed, course and number of satellites; the altitude stays that above mean sea level"
-_FROM_GPS = "covariances but for a dilution of precision, the service; speed and course are NaN"
-_ALL = "everything: there is no way back"
+_FROM_ODOMETRY = "z, roll, pitch, and their rates, covariances"
+_FROM_TWIST = "the vertical velocity, the rates of roll and pitch"
+_FROM_POSE = "z, roll, pitch"
+_GPS = "speed, course, satellites in use, the height of the geoid: the altitude stays that above mean sea level"
+_FROM_GPS = "covariances, except as a dilution of precision, and the service; speed and course are NaN"
+_ONE_WAY = "not possible"
 
 
 def _in_both(cls: type[Message], theirs: str, make: Callable[[RosParts], Functions], to: str, back: str) -> TypePair:
@@ -123,18 +123,16 @@ def _in_both(cls: type[Message], theirs: str, make: Callable[[RosParts], Functio
 
 
 PAIRS = (
-    _in_both(ours.IMU, "sensor_msgs/Imu", standard.imu, _IMU, f"{_FROM_IMU}, {_NO_STAMP}"),
+    _in_both(ours.IMU, "sensor_msgs/Imu", standard.imu, _IMU, _FROM_IMU),
     _in_both(ours.StampedIMU, "sensor_msgs/Imu", standard.imu, _IMU, _FROM_IMU),
-    _in_both(
-        ours.Odometry, "nav_msgs/Odometry", standard.odometry, _ODOMETRY, f"{_PLANE}, {_COVARIANCES}, {_NO_STAMP}"
-    ),
-    _in_both(ours.StampedOdometry, "nav_msgs/Odometry", standard.odometry, _ODOMETRY, f"{_PLANE}, {_COVARIANCES}"),
-    _in_both(ours.Velocity3, "geometry_msgs/Twist", standard.velocity, "", _PLANE),
-    _in_both(ours.Velocity3, "geometry_msgs/TwistStamped", standard.velocity, "", f"{_PLANE}, {_NO_STAMP}"),
-    _in_both(ours.StampedVelocity3, "geometry_msgs/TwistStamped", standard.velocity, "", _PLANE),
-    _in_both(ours.Pose3, "geometry_msgs/Pose", standard.pose, "", _PLANE),
-    _in_both(ours.Pose3, "geometry_msgs/PoseStamped", standard.pose, "", f"{_PLANE}, {_NO_STAMP}"),
-    _in_both(ours.StampedPose3, "geometry_msgs/PoseStamped", standard.pose, "", _PLANE),
+    _in_both(ours.Odometry, "nav_msgs/Odometry", standard.odometry, _ODOMETRY, _FROM_ODOMETRY),
+    _in_both(ours.StampedOdometry, "nav_msgs/Odometry", standard.odometry, _ODOMETRY, _FROM_ODOMETRY),
+    _in_both(ours.Velocity3, "geometry_msgs/Twist", standard.velocity, "", _FROM_TWIST),
+    _in_both(ours.Velocity3, "geometry_msgs/TwistStamped", standard.velocity, "", _FROM_TWIST),
+    _in_both(ours.StampedVelocity3, "geometry_msgs/TwistStamped", standard.velocity, "", _FROM_TWIST),
+    _in_both(ours.Pose3, "geometry_msgs/Pose", standard.pose, "", _FROM_POSE),
+    _in_both(ours.Pose3, "geometry_msgs/PoseStamped", standard.pose, "", _FROM_POSE),
+    _in_both(ours.StampedPose3, "geometry_msgs/PoseStamped", standard.pose, "", _FROM_POSE),
     _in_both(
         ours.Battery,
         "sensor_msgs/BatteryState",
@@ -146,17 +144,17 @@ PAIRS = (
         ours.Proximity,
         "sensor_msgs/Range",
         standard.proximity,
-        "the field of view; it is four messages, in the frames `TOPIC_0` to `TOPIC_3`",
+        "the field of view; four messages, in the frames `TOPIC_0` to `TOPIC_3`",
         "field of view and limits; a frame's last digit says which of the four readings it is",
     ),
-    _in_both(ours.GPS, "sensor_msgs/NavSatFix", standard.gps, _GPS, f"{_FROM_GPS}, {_NO_STAMP}"),
+    _in_both(ours.GPS, "sensor_msgs/NavSatFix", standard.gps, _GPS, _FROM_GPS),
     _in_both(ours.StampedGPS, "sensor_msgs/NavSatFix", standard.gps, _GPS, _FROM_GPS),
     _in_both(
         ours.Pressure,
         "sensor_msgs/FluidPressure",
         standard.pressure,
-        "the altitude and a variance",
-        f"variance, {_NO_STAMP}; the altitude is computed by the standard atmosphere",
+        "the altitude, and a variance",
+        "the variance; the altitude is computed by the standard atmosphere",
     ),
     TypePair(
         ours.Log,
@@ -164,18 +162,18 @@ PAIRS = (
         "rcl_interfaces/Log",
         reports.log,
         "file, function and line",
-        "file, function, line; texts over 128 characters, names over 7 and 8, and characters beyond ASCII",
+        "file, function, line; more than 128 characters, and others than ASCII; long names become aliases",
     ),
-    _in_both(ours.GatewayStatus, "diagnostic_msgs/DiagnosticArray", reports.gateway_status, "", _ALL),
+    _in_both(ours.GatewayStatus, "diagnostic_msgs/DiagnosticArray", reports.gateway_status, "", _ONE_WAY),
     _in_both(
         ours.PowerEvent,
         "diagnostic_msgs/DiagnosticArray",
         reports.power_event,
-        "those that were just crossed",
-        _ALL,
+        "the thresholds that were just crossed",
+        _ONE_WAY,
     ),
-    _in_both(ours.BusTraffic, "diagnostic_msgs/DiagnosticArray", reports.bus_traffic, "", _ALL),
+    _in_both(ours.BusTraffic, "diagnostic_msgs/DiagnosticArray", reports.bus_traffic, "", _ONE_WAY),
     _in_both(ours.Float32, "std_msgs/Float32", standard.number, "", ""),
-    _in_both(ours.Text, "std_msgs/String", standard.text, "", "texts over 64 characters, characters beyond ASCII"),
+    _in_both(ours.Text, "std_msgs/String", standard.text, "", "more than 64 characters, and others than ASCII"),
 )
 """All pairs; the first one of a class is its standard type."""

@@ -9,6 +9,7 @@ from collections import Counter
 from typing import Annotated
 
 import r2p.msg
+from r2p.errors import MessageError
 from r2p.messages import Max, Message, Timestamp, f64
 from r2p.ros.stamps import StampSource
 from r2p.ros.standard import BASE, ODOM, quaternion
@@ -74,6 +75,10 @@ async def _publish_poses(node: Node, type: type[r2p.msg.Odometry] | type[r2p.msg
     stamps = StampSource(type, Counter())
     async for sample in poses.samples():
         pose = sample.message.pose
-        header = r2p.msg.Header(stamp=Timestamp.from_ns(stamps.find(sample)), frame_id=frame.value)
+        try:
+            stamp = Timestamp.from_ns(stamps.find(sample))
+        except MessageError:  # of a module whose clock is beyond 2106
+            continue
+        header = r2p.msg.Header(stamp=stamp, frame_id=frame.value)
         place = Transform(Vector3(pose.x, pose.y), quaternion(Quaternion, 0.0, 0.0, pose.w))
         await transforms.publish(TFMessage((TransformStamped(header, child.value, place),)))

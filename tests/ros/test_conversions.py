@@ -288,6 +288,13 @@ def test_any_numbers_are_converted_or_refused(cls: Any, version: int, data: byte
         found.from_ros(message).encode()
 
 
+@given(st.sampled_from([1, 2]), st.text(max_size=40), st.text(max_size=200), st.integers(0, 100))
+def test_any_log_record_of_ros_is_one_of_r2p(version: int, name: str, text: str, level: int) -> None:
+    found = pair(Log, version)
+    record = found.from_ros(msgspec.structs.replace(found.theirs(), name=name, msg=text, level=level))
+    assert Log.decode(record.encode()) is not None
+
+
 def test_orientations_that_are_not_rotations() -> None:
     """An Imu without an orientation has none here, either; elsewhere zeros, which ROS's tools send, are an error."""
     found = pair(msg.IMU, 2)
