@@ -18,7 +18,7 @@ def _exit(_number: int, _frame: FrameType | None) -> None:
     os._exit(INTERRUPTED)  # nothing has been opened or written yet
 
 
-def _is_command() -> bool:
+def is_command() -> bool:
     """Return whether this program is the `r2p` script, or `python -m r2p`, whose argv[0] is `-m` until it runs."""
     name = os.path.basename(sys.argv[0]) if sys.argv else ""  # noqa: PTH119 - pathlib takes longer to import
     return name in ("r2p", "r2p.exe") or (name == "-m" and "r2p" in sys.orig_argv)
@@ -27,7 +27,7 @@ def _is_command() -> bool:
 def exit_on_interrupt() -> None:
     """Let Ctrl-C end the command from now on; other programs and their handlers stay as they are."""
     in_main = threading.current_thread() is threading.main_thread()
-    if in_main and _is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored
+    if in_main and is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored
         signal.signal(signal.SIGINT, _exit)
 
 

@@ -64,6 +64,10 @@ class ExposedParameters:
         if refusal:
             self._link.stats.lost["change refused"] += 1
             raise ParameterError(refusal)
+        await self.apply_own(module, values)
+
+    async def apply_own(self, module: str, values: Mapping[Name, object]) -> None:
+        """Set parameters as `apply`, for the user who has started this program."""
         await self._network.set_parameters(module, values)
         found = await self._network.parameters(module)  # or the old values would count until the next look
         self._update(module, {(each.node, each.name): each for each in found})

@@ -31,15 +31,24 @@ class GraphNames:
         self.ns = options.ns
         self._absolute = frozenset(options.absolute)
         self._tool = tool
+        self._remapped = dict(options.remappings)
+        self._remapped_from = {there: here for here, there in options.remappings.items()}
+        self._program = options.node_name
+        self._first = ""
+        """The node that has the program's name."""
 
     def to_ros(self, topic: str) -> str | None:
         """Return the name of a topic or a service on the ROS network; None if ROS has no such names."""
         topic = _ROS_NAMES.get(topic, topic)
         name = f"/{topic}" if topic in self._absolute else f"{self.ns}/{topic}"
+        name = self._remapped.get(name, name)
         return name if len(name) <= NAME_MAX and _ROS_TOPIC.fullmatch(name) else None
 
     def from_ros(self, name: str) -> str | None:
         """Return the name of a ROS topic or service here."""
+        if name in self._remapped:
+            return None  # what is called so here has another name there
+        name = self._remapped_from.get(name, name)
         topic = name[1:]
         if topic not in self._absolute:
             topic = name.removeprefix(f"{self.ns}/")
@@ -50,7 +59,7 @@ class GraphNames:
 
     def is_inside(self, name: str) -> bool:
         """Return whether a ROS topic is in the namespace, or one that ROS has once."""
-        return name.startswith(f"{self.ns}/") or name[1:] in self._absolute
+        return name in self._remapped_from or name.startswith(f"{self.ns}/") or name[1:] in self._absolute
 
     def node(self, *parts: str) -> str:
         """Return the full name of the ROS node of a module or node: `/robot1/blink`."""
@@ -58,6 +67,17 @@ class GraphNames:
             node = "" if parts[-1] == self._tool else f"{parts[-1]}_"
             return f"{self.ns}/{_TOOL}{node}{self._tool.lstrip('_')}"
         return self.ns + _DIGIT.sub("n", f"/{'/'.join(parts)}")
+
+    def own_node(self, name: str, module: str) -> str:
+        """Return the full name of the ROS node of a node of this module, or of the module itself.
+
+        With a name for the program, the module and its first node have that.
+        """
+        if not self._program or self._tool:
+            return self.node(name)
+        if name != module:
+            self._first = self._first or name
+        return self.node(self._program if name in (module, self._first) else f"{self._program}_{name}")
 
     def is_tool(self, node: str) -> bool:
         """Return whether another ROS node is a command of r2p."""

@@ -108,7 +108,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._types = TopicTypes(middleware.version, options, hub.space.module, self.stats.lost)
         self._background = BackgroundResults(hub.space.loop, self._touch)
         self._classes = TopicClasses(hub, self._types, self._background, self._describe, self._touch)
-        module_node = self.names.node(hub.space.module)
+        module_node = self.names.own_node(hub.space.module, hub.space.module)
         self._registrations = Registrations(
             middleware, module_node, hub.space.loop, lambda: self._touch(LOG), at_once=hub.observer
         )
@@ -281,7 +281,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         if topic == LOG:
             return {("", LOG): self._log_node()}
         own = self._ros.own_nodes.get((topic, role), {})
-        found = {("", node): self.names.node(node) for node in own if node}
+        found = {("", node): self.names.own_node(node, self._space.module) for node in own if node}
         if self.options.ros_nodes:
             for module, node in self._ros.relayed_nodes.get((topic, role), {}):
                 if module and node:

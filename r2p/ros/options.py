@@ -53,6 +53,10 @@ class RosOptions(msgspec.Struct, frozen=True, kw_only=True):
     without the first slash. `types` has the classes of topics and services that no node here has a class for, and
     `ros_types` the full names of the ROS types that topics are to have there. `qos` changes the quality of service.
     With `ros_nodes` each node behind a gateway is shown as a ROS node of its own.
+
+    `remappings` are other full names on the ROS network for topics and services, by the full names that they would have
+    (`{"/chatter": "/talk"}`). `node_name` is the name there of the program: of its first node, and the beginning of the
+    names of others (`left`, `left_other`).
     """
 
     ns: str = ""
@@ -61,6 +65,8 @@ class RosOptions(msgspec.Struct, frozen=True, kw_only=True):
     ros_types: Mapping[str, str] = {}
     qos: Mapping[str, QosChange] = {}
     ros_nodes: bool = False
+    remappings: Mapping[str, str] = {}
+    node_name: str = ""
 
 
 def merged(options: RosOptions, others: RosOptions) -> RosOptions:

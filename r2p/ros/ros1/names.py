@@ -14,6 +14,7 @@ import msgspec
 import yaml
 
 from r2p.errors import InvalidName
+from r2p.ros.options import RosOptions, namespace
 
 _NAME: Final = re.compile(r"[~/]?[A-Za-z][A-Za-z0-9_/]*|/")
 _BASE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -52,16 +53,16 @@ class RosArguments(msgspec.Struct, frozen=True):
     parameters: Mapping[str, object]
     special: Mapping[str, str]
 
-    def remapped(self, name: str, node: str) -> str:
-        """Return the full name that takes the place of `name`, as `node` says it."""
-        full = resolve(name, node)
-        for key, value in self.remappings.items():
-            if resolve(key, node) == full:
-                return resolve(value, node)
-        return full
+    def options(self, options: RosOptions, environment: str) -> RosOptions:
+        """Return options with what is said here, or by ROS_NAMESPACE in the environment; what is in them comes first.
 
-
-NO_ARGUMENTS: Final = RosArguments({}, {}, {})
+        Raises ValueError for an invalid name.
+        """
+        ns = options.ns or namespace(self.special.get("ns") or environment)
+        name = base_name(self.special["name"]) if "name" in self.special else ""
+        node = f"{ns}/{name or 'r2p'}"
+        remappings = {resolve(here, node): resolve(there, node) for here, there in self.remappings.items()}
+        return msgspec.structs.replace(options, ns=ns, node_name=name, remappings=remappings)
 
 
 def arguments(argv: Iterable[str]) -> tuple[RosArguments, list[str]]:

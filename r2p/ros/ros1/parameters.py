@@ -7,7 +7,7 @@ that were not there before are deleted at the end.
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 from r2p.codecs.parameters import Name
@@ -52,18 +52,29 @@ class _Mirrored:
         """True once the server has said what it has."""
         self.was_set = False
         """True if the key was there before."""
+        self.is_new = True
 
 
 class ParameterMirror:
     """Keeps the parameters of one link, and those on a ROS 1 parameter server, the same."""
 
-    def __init__(self, hub: Hub, link: Link, names: Callable[[str, str], str], session: MasterSession) -> None:
-        """`names` returns the ROS node of a module's node, whose parameters are below it."""
+    def __init__(
+        self,
+        hub: Hub,
+        link: Link,
+        names: Callable[[str, str], str],
+        session: MasterSession,
+        given: Mapping[str, object],
+    ) -> None:
+        """`names` returns the ROS node of a module's node, whose parameters are below it. `given` are first values for
+        parameters of this module, by name.
+        """
         self._exposed = ExposedParameters(hub, link, self._module_changed)
         self._hub = hub
         self._link = link
         self._node_name = names
         self._session = session
+        self._given = given
         self._client = XmlRpcClient()
         self._master = MasterClient(self._client, session.master_uri)
         self._mirrored: dict[str, _Mirrored] = {}
@@ -166,6 +177,9 @@ class ParameterMirror:
                 await asyncio.sleep(_RETRY_S)
 
     async def _settle(self, each: _Mirrored) -> None:
+        if each.is_new:
+            each.is_new = False
+            await self._give(each)
         if not each.module:
             await self._remove(each)
         elif each.is_known and each.theirs != each.ours:
@@ -175,6 +189,17 @@ class ParameterMirror:
             each.theirs = each.ours
         if each.is_known:
             each.agreed = each.ours
+
+    async def _give(self, each: _Mirrored) -> None:
+        """Set a parameter of this module to what the command line has for it."""
+        if each.module != self._exposed.own_module or each.name[1] not in self._given:
+            return
+        try:
+            await self._exposed.apply_own(each.module, {each.name: self._given[each.name[1]]})
+        except (Error, TimeoutError) as error:
+            self._notice(each.key, f"_{each.name[1]}:= of the command line is not used: {error}")
+        else:
+            each.agreed = each.theirs  # it wins over what is on the server
 
     async def _accept(self, each: _Mirrored) -> bool:
         """Set the parameter to what the server has; return whether it was accepted."""
@@ -222,7 +247,7 @@ def node_names(names: GraphNames, own_module: str, *, ros_nodes: bool) -> Callab
 
     def name(module: str, node: str) -> str:
         if module == own_module:
-            return names.node(node)
+            return names.own_node(node, own_module)
         return names.node(module, node) if ros_nodes else names.node(own_module, module, node)
 
     return name

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final, Literal, NamedTuple
 
-from r2p.errors import NoServer, TransportError
+from r2p.errors import Broken, NoServer, TransportError
 from r2p.ros.middleware import MiddlewareUser, RosGraph, RosPeerEndpoint, RosPeerServer
 from r2p.ros.ros1.environment import RosAddress, reachable_host, uri_of
 from r2p.ros.ros1.master import MasterClient, MasterError, SystemState, value_of
@@ -64,6 +64,9 @@ class MasterSession:
         self.master = MasterClient(self.client, address.master)
         self.host = address.host or "127.0.0.1"
         """The host by which others reach this computer, as far as that is known."""
+        self.ends_when_taken = False
+        """True to end with Broken when another node takes the name of one of the nodes, as a rospy node ends."""
+        self._broken = ""
         self._user: MiddlewareUser | None = None
         self._nodes: dict[str, SlaveNode] = {}
         self._parameters: dict[str, OnParameter] = {}
@@ -184,11 +187,16 @@ class MasterSession:
     # What runs
 
     async def run(self, user: MiddlewareUser, opened: Callable[[], object]) -> None:
-        """Stay registered until cancelled; then unregister everything, and close the slave servers."""
+        """Stay registered until cancelled; then unregister everything, and close the slave servers.
+
+        Raises Broken if a node's name was taken, and the session is to end then.
+        """
         self._user = user
         opened()
         try:
             while True:
+                if self._broken:
+                    raise Broken(self._broken)
                 try:
                     await self._step()
                     pause = max(0.0, self._look_at - _now())
@@ -374,9 +382,11 @@ class MasterSession:
         with contextlib.suppress(MasterError, *_GONE):
             answer = await self.client.call(uri, "getPid", node, timeout=_ASK_S)
             process = f" (process {value_of('getPid', answer)!r:.20})"
-        await self._end_asked(
-            node, f"another node has taken its name, at {uri}{process}: give one of them another name"
-        )
+        reason = f"another node has taken its name, at {uri}{process}: give one of them another name"
+        if self.ends_when_taken:
+            self._broken = f"{node} is no longer a ROS node: {reason}"
+            self._touch()
+        await self._end_asked(node, reason)
 
     async def _end_asked(self, node: str, reason: str) -> None:
         if node in self._nodes and self._user is not None:

@@ -1,7 +1,8 @@
 """`ros1:`: a link to a ROS 1 network, with its topics and services, and the parameter server."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, cast
 
 from r2p.ros.link import RosLink, RosTransport
 from r2p.ros.options import RosOptions
@@ -10,20 +11,36 @@ from r2p.ros.ros1.middleware import Ros1Middleware
 from r2p.ros.ros1.parameters import ParameterMirror, node_names
 from r2p.transports.link import Hub
 
+if TYPE_CHECKING:
+    from r2p.modules.link_manager import LinkManager
+
 
 class Ros1Transport(RosTransport):
-    """Opens the link, and keeps the parameters of its nodes on the parameter server."""
+    """Opens the link, and keeps the parameters of its nodes on the parameter server.
 
-    def __init__(self, name: str, address: RosAddress, options: RosOptions | None = None) -> None:
+    When another node takes the name of one of them, a program ends, as one of rospy does; a gateway goes on without it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        address: RosAddress,
+        options: RosOptions | None = None,
+        parameters: Mapping[str, object] | None = None,
+    ) -> None:
+        """`parameters` are values for the parameters of this program's nodes, by name."""
         super().__init__(name, lambda _hub: Ros1Middleware(address), options)
+        self._parameters = parameters or {}
 
     async def run_link(self, hub: Hub, link: RosLink, opened: Callable[[], object]) -> None:
+        assert isinstance(link.middleware, Ros1Middleware)
+        manager = cast("LinkManager", hub)
+        link.middleware.session.ends_when_taken = manager.bridge is None
         if hub.observer:  # a command has no parameters
             await super().run_link(hub, link, opened)
             return
-        assert isinstance(link.middleware, Ros1Middleware)
         names = node_names(link.names, hub.space.module, ros_nodes=self.options.ros_nodes)
-        mirror = ParameterMirror(hub, link, names, link.middleware.session)
+        mirror = ParameterMirror(hub, link, names, link.middleware.session, self._parameters)
         mirroring = asyncio.get_running_loop().create_task(mirror.run())
         try:
             await super().run_link(hub, link, opened)
