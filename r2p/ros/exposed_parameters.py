@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MODULES_PERIOD_S = 1.0
 """Seconds between two looks at which modules there are behind a gateway."""
-_OWN_PERIOD_S, _REMOTE_PERIOD_S = 0.2, 1.0  # seconds between two questions for what has changed
+_OWN_PERIOD_S, _REMOTE_PERIOD_S = 0.1, 1.0  # seconds between two questions for what has changed
 _RETRY_S = 2.0  # seconds until a module that did not answer is asked again
 
 

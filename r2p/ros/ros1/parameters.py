@@ -116,8 +116,8 @@ class ParameterMirror:
             elif known is None:
                 self._mirrored[key] = _Mirrored(key, module, name, value)
                 self._watch(key)
-            elif known.ours != value:
-                known.ours = value
+            elif known.ours != value or not known.module:
+                known.ours, known.module, known.name = value, module, name
                 self._mark([key])
         for key in [key for key, each in self._mirrored.items() if each.module == module and key not in keys]:
             self._mark([key])
@@ -168,7 +168,8 @@ class ParameterMirror:
             key = next(iter(self._changed))
             del self._changed[key]
             try:
-                await self._settle(self._mirrored[key])
+                if (each := self._mirrored.get(key)) is not None:
+                    await self._settle(each)
             except MasterError as error:
                 self._notice(key, f"the ROS master refuses the parameter {key}: {error}")
             except _MASTER_ERRORS:  # the session says what is wrong, and what is set when it is back

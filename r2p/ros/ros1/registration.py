@@ -25,6 +25,9 @@ LOOK_S: Final = 1.0
 RETRY_S: Final = 0.25
 """Seconds between two attempts to reach a master."""
 
+PUBLISHERS_MAX: Final = 1000
+"""Publishers of a topic that are connected to; further ones are counted."""
+
 _SOON_S: Final = 0.05  # seconds from a hint of the master that something has changed to the next look
 _CLOSE_S: Final = 2.0  # seconds for a master to take what is unregistered at the end
 _ASK_S: Final = 1.0  # seconds for another node to say who it is
@@ -64,8 +67,8 @@ class MasterSession:
         self.master = MasterClient(self.client, address.master)
         self.host = address.host or "127.0.0.1"
         """The host by which others reach this computer, as far as that is known."""
-        self.ends_when_taken = False
-        """True to end with Broken when another node takes the name of one of the nodes, as a rospy node ends."""
+        self.ends_without_nodes: Callable[[], bool] = lambda: False
+        """Returns whether to end, with Broken, when another node has taken the name of the only node."""
         self._broken = ""
         self._user: MiddlewareUser | None = None
         self._nodes: dict[str, SlaveNode] = {}
@@ -175,21 +178,21 @@ class MasterSession:
         try:
             async with asyncio.timeout(timeout):
                 uri = await self.master.lookup_service(node, service)
-            parts = split_uri(uri, "rosrpc")
+            host, port = split_uri(uri, "rosrpc")[1:]
         except MasterError:
             raise NoServer(f"no ROS node serves {service}") from None
         except TimeoutError:
             raise
         except _GONE as error:
             raise NoServer(f"{service} can't be found: {_reason(self.address.master, error)}") from None
-        return str(parts.hostname), int(parts.port or 0)
+        return host, port
 
     # What runs
 
     async def run(self, user: MiddlewareUser, opened: Callable[[], object]) -> None:
         """Stay registered until cancelled; then unregister everything, and close the slave servers.
 
-        Raises Broken if a node's name was taken, and the session is to end then.
+        Raises Broken if the name of the only node was taken, and the session is to end then.
         """
         self._user = user
         opened()
@@ -200,7 +203,7 @@ class MasterSession:
                 try:
                     await self._step()
                     pause = max(0.0, self._look_at - _now())
-                except _GONE as error:
+                except (MasterError, *_GONE) as error:
                     self._note_gone(error)
                     pause = RETRY_S
                 with contextlib.suppress(TimeoutError):
@@ -349,7 +352,10 @@ class MasterSession:
         self.look_soon()
         own = {self.slave_uri(each) for each in self._nodes}
         if node in self._nodes and topic in self._nodes[node].subscriptions:
-            self.slaves.publishers_changed(node, topic, [uri for uri in publishers if uri not in own])
+            others = [uri for uri in dict.fromkeys(publishers) if uri not in own]
+            if len(others) > PUBLISHERS_MAX:
+                self.lost["publishers over the limit"] += len(others) - PUBLISHERS_MAX
+            self.slaves.publishers_changed(node, topic, others[:PUBLISHERS_MAX])
 
     def parameter_updated(self, node: str, key: str, value: Value) -> bool:
         """Note the value of a parameter; return whether it was subscribed."""
@@ -372,7 +378,8 @@ class MasterSession:
         uri = "an unknown place"
         with contextlib.suppress(MasterError, *_GONE):
             uri = await self.master.lookup_node(node, node)
-        await self._end_taken(node, uri)
+        if node in self._nodes and uri != self.slave_uri(node):  # else the master has not said that
+            await self._end_taken(node, uri)
 
     async def _end_taken(self, node: str, uri: str) -> None:
         """End a node without unregistering it: its registrations are those of the other one, or gone."""
@@ -383,7 +390,7 @@ class MasterSession:
             answer = await self.client.call(uri, "getPid", node, timeout=_ASK_S)
             process = f" (process {value_of('getPid', answer)!r:.20})"
         reason = f"another node has taken its name, at {uri}{process}: give one of them another name"
-        if self.ends_when_taken:
+        if self._nodes.keys() == {node} and self.ends_without_nodes():
             self._broken = f"{node} is no longer a ROS node: {reason}"
             self._touch()
         await self._end_asked(node, reason)

@@ -14,14 +14,14 @@ import msgspec
 from r2p.ros.middleware import RosGraph
 from r2p.ros.ros1.master import MasterError, value_of
 from r2p.ros.ros1.names import join
-from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError
+from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError, is_host
 from r2p.ros.ros1.xmlrpc_codec import Value
 
 TCPROS: Final = "TCPROS"
 """The only transport of ROS 1 that everything has."""
 
 _MULTICALL: Final = "system.multicall"
-_CALLS_MAX: Final = 1000  # calls in one
+_CALLS_MAX: Final = 100  # calls in one
 _TEXT_MAX: Final = 1000  # characters of what another node says, in what users see
 _OK, _FAILURE, _ERROR = 1, 0, -1
 
@@ -253,6 +253,6 @@ async def request_topic(client: XmlRpcClient, uri: str, node: str, topic: str, t
     except MasterError as error:
         raise XmlRpcError(f"the publisher of {topic} at {uri} refuses the connection: {error}") from None
     match value:
-        case ["TCPROS", str(host), int(port), *_] if host and 0 < port < 65536:
+        case ["TCPROS", str(host), int(port), *_] if is_host(host) and 0 < port < 65536:
             return host, port
     raise XmlRpcError(f"the publisher of {topic} at {uri} does not say where to connect: {value!r:.200}")

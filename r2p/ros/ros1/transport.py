@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Ros1Transport(RosTransport):
     """Opens the link, and keeps the parameters of its nodes on the parameter server.
 
-    When another node takes the name of one of them, a program ends, as one of rospy does; a gateway goes on without it.
+    When another node takes the name of the only one, a program that has no other link ends, as one of rospy does.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class Ros1Transport(RosTransport):
     async def run_link(self, hub: Hub, link: RosLink, opened: Callable[[], object]) -> None:
         assert isinstance(link.middleware, Ros1Middleware)
         manager = cast("LinkManager", hub)
-        link.middleware.session.ends_when_taken = manager.bridge is None
+        link.middleware.session.ends_without_nodes = lambda: manager.bridge is None and manager.links == [link]
         if hub.observer:  # a command has no parameters
             await super().run_link(hub, link, opened)
             return

@@ -8,11 +8,12 @@ servers compress long answers for clients that accept it; this one does not.
 import asyncio
 import contextlib
 import logging
+import re
 import socket
 from collections import Counter
 from collections.abc import Callable
 from typing import Final
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import quote, urlsplit
 
 from r2p.errors import DecodeError, Error
 from r2p.ros.ros1.xmlrpc_codec import (
@@ -37,6 +38,9 @@ CONNECTIONS_MAX: Final = 64
 _HEADER_MAX: Final = 16 * 1024  # bytes
 _PIECE: Final = 32 * 1024  # bytes parsed at once: a few milliseconds
 _CLOSE_S: Final = 0.5  # seconds for callers to take their last answers
+_HOST: Final = re.compile(
+    r"(?=.{1,253}$)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?|[0-9A-Fa-f:.]{2,45}(%[A-Za-z0-9_.-]{1,15})?"
+)
 _SHOWN: Final = 300  # characters of another program's text in an error
 
 
@@ -122,7 +126,7 @@ class XmlRpcClient:
     async def _ask(self, uri: str, body: bytes, timeout: float, *, keep: bool) -> XmlResult | XmlFault:
         connection = self._kept.get(uri) if keep else None
         if connection is None:
-            connection = _HttpConnection(split_uri(uri))
+            connection = _HttpConnection(*split_uri(uri))
             if keep:
                 self._kept[uri] = connection
         try:
@@ -144,27 +148,33 @@ class XmlRpcClient:
         self._kept.clear()
 
 
-def split_uri(uri: str, scheme: str = "http") -> SplitResult:
-    """Return the parts of the URI of a server, which has a host and a port. Raises XmlRpcError."""
+def split_uri(uri: str, scheme: str = "http") -> tuple[str, str, int]:
+    """Return path, host and port of the URI of a server. Raises XmlRpcError."""
     with contextlib.suppress(ValueError):
         parts = urlsplit(uri)
-        if parts.scheme == scheme and parts.hostname and parts.port:
-            return parts
+        if parts.scheme == scheme and is_host(parts.hostname or "") and parts.port:
+            return quote(parts.path or "/"), str(parts.hostname), parts.port
     raise XmlRpcError(f"{uri[:_SHOWN]!r} is not the URI of a server: those look like {scheme}://host:11311/")
+
+
+def is_host(text: str) -> bool:
+    """Return whether a text may be the name or the address of a computer, so that looking it up never raises."""
+    return _HOST.fullmatch(text) is not None
 
 
 class _HttpConnection:
     """One connection to a server, opened when it is needed."""
 
-    def __init__(self, server: SplitResult) -> None:
+    def __init__(self, path: str, host: str, port: int) -> None:
         self.lock = asyncio.Lock()
-        self._server = server
+        self._path, self._host, self._port = path, host, port
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def ask(self, body: bytes) -> XmlResult | XmlFault:
         """Return the answer. If the server has closed an idle connection, ask again on a new one."""
+        host = f"[{self._host}]" if ":" in self._host else self._host
         head = (
-            f"POST {self._server.path or '/'} HTTP/1.1\r\nHost: {self._server.netloc}\r\nUser-Agent: r2p\r\n"
+            f"POST {self._path} HTTP/1.1\r\nHost: {host}:{self._port}\r\nUser-Agent: r2p\r\n"
             f"Content-Type: text/xml\r\nContent-Length: {len(body)}\r\n\r\n"
         )
         if self._streams is not None:
@@ -191,8 +201,7 @@ class _HttpConnection:
                 self.close()
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-        host, port = self._server.hostname, self._server.port
-        streams = await asyncio.open_connection(host, port, limit=_HEADER_MAX)
+        streams = await asyncio.open_connection(self._host, self._port, limit=_HEADER_MAX)
         _send_at_once(streams[1])
         return streams
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import r2p
+from r2p.ros import exposed_parameters
 from r2p.ros.ros1 import from_url
 from r2p.ros.ros1.master import MasterClient, MasterError
 from r2p.ros.ros1.xmlrpc import XmlRpcClient
@@ -32,6 +33,12 @@ pytestmark = [
 class Mode(enum.Enum):
     OFF = 0
     ON = 1
+
+
+@pytest.fixture(autouse=True)
+def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("MODULES_PERIOD_S", "_OWN_PERIOD_S", "_REMOTE_PERIOD_S"):
+        monkeypatch.setattr(exposed_parameters, name, 0.05)
 
 
 @pytest.fixture
@@ -114,6 +121,16 @@ async def test_names_with_parts_are_namespaces(
         await until(lambda: "PC1/blink.pid is not on the parameter server: /blink/pid/kp is there" in caplog.text)
         assert (await ros1.run("rosparam", "set", "/blink/pid/kp", "0.7")).code == 0
         await until(lambda: kp.value == 0.7)
+
+
+async def test_a_node_that_starts_again(ros1: Ros1, master: MasterClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    via = transport(ros1, monkeypatch)
+    async with r2p.Module("PC1", via=via, allow_control=True) as module:
+        for default in (0.5, 0.6):
+            async with node_in(module, name="again") as node:
+                node.parameter("kp", default)
+                await value(master, "/again/kp", default)
+        await value(master, "/again", {})
 
 
 async def test_without_permission(

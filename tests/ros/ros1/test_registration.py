@@ -9,6 +9,7 @@ import pytest
 
 from r2p.errors import NoServer
 from r2p.ros.middleware import RosPeerEndpoint
+from r2p.ros.ros1 import registration
 from r2p.ros.ros1.master import MasterClient, MasterError
 from r2p.ros.ros1.slave import BusConnection, request_topic
 from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError
@@ -28,6 +29,11 @@ pytestmark = [
 ]
 
 STRING = "std_msgs/String"
+
+
+@pytest.fixture(autouse=True)
+def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registration, "LOOK_S", 0.1)
 
 
 @pytest.fixture
@@ -174,6 +180,33 @@ async def test_a_service_that_another_node_takes(ros1: Ros1, rospy_peer: RospyPe
         _, text, trouble = await recorder.event("notice")
         assert (text, trouble) == ("the service /reset of /one is now that of /peer, which was started later", True)
     await rospy_peer.do("unserve", service="/reset")
+
+
+async def test_an_end_that_the_master_has_not_asked_for(ros1: Ros1) -> None:
+    """Anybody can call a node; and its port may have been that of another node, whose end the master wants."""
+    async with running(ros1.uri, "/one") as (session, recorder):
+        session.advertise("/one", "/spin", STRING)
+        await recorder.event("up")
+        for name in ("/one", "/other"):
+            reason = f"[{name}] Reason: new node registered with same name"
+            answer = await session.client.call(session.slave_uri("/one"), "shutdown", "/master", reason)
+            assert answer == [1, "shutdown", 0]
+        await session.master.get_pid("/one")  # the session has asked the master before
+        session.advertise("/one", "/more", STRING)
+        done = await ros1.run("rostopic", "info", "/more")
+        assert "* /one (http://127.0.0.1:" in done.output
+        assert not [event for event in recorder.events if event[0] == "shut_down"]
+
+
+async def test_more_publishers_than_a_node_connects_to(ros1: Ros1, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registration, "PUBLISHERS_MAX", 2)
+    async with running(ros1.uri, "/one") as (session, recorder):
+        session.subscribe("/one", "/chat", STRING)
+        await recorder.event("publishers")
+        uris = ["http://a:1/", "http://b:1/", "http://a:1/", "http://c:1/", session.slave_uri("/one")]
+        await session.client.call(session.slave_uri("/one"), "publisherUpdate", "/master", "/chat", uris)
+        assert (await recorder.event("publishers"))[3] == ["http://a:1/", "http://b:1/"]
+        assert session.lost == {"publishers over the limit": 1}
 
 
 async def test_what_the_master_refuses_is_said(ros1: Ros1) -> None:

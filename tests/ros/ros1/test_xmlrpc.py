@@ -119,7 +119,16 @@ async def test_errors_name_the_call(server: XmlRpcServer, client: XmlRpcClient) 
         await client.call(uri(server), "refuse")
     with pytest.raises(XmlRpcError, match="cannot marshal"):
         await client.call(uri(server), "echo", object())
-    for wrong in ("robot", "https://robot:1/", "http://robot/", "http://[::1", "http://robot:99999/"):
+    long = f"http://{'a' * 64}:1/"
+    for wrong in (
+        "robot",
+        "https://robot:1/",
+        "http://robot/",
+        "http://[::1",
+        "http://robot:99999/",
+        long,
+        "http://\0:1/",
+    ):
         with pytest.raises(XmlRpcError, match=r"is not the URI of a server: those look like http://host:11311/"):
             await client.call(wrong, "echo")
     with pytest.raises(OSError, match=r"Connect call failed|refused"):
