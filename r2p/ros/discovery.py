@@ -5,7 +5,7 @@ module has. For each topic that changes, `review` is called soon after, once for
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import msgspec
 
@@ -46,10 +46,20 @@ _CLIENTS = "clients"
 
 
 class RosDiscovery(DiscoveryProtocol):
-    """The discovery of one module on a ROS network; `review(topic)` is called after changes of its own topics."""
+    """The discovery of one module on a ROS network; `review(topic)` is called after changes of its own topics.
+
+    `is_taken(name, instance)` says whether another module has the name of a ROS node on another link: such a node is
+    not shown as a module, as no two may have one name.
+    """
 
     def __init__(
-        self, module: str, instance: int, names: GraphNames, review: Callable[[str], None], counts: Counter[str]
+        self,
+        module: str,
+        instance: int,
+        names: GraphNames,
+        review: Callable[[str], None],
+        is_taken: Callable[[str, int], bool],
+        counts: Counter[str],
     ) -> None:
         super().__init__(module, instance, counts, LinkNames())
         self.modules: dict[str, ModuleInfo] = {}
@@ -65,6 +75,13 @@ class RosDiscovery(DiscoveryProtocol):
         self._relayed_modules: dict[int, str] = {}
         self._names = names
         self._review = review
+        self._is_taken = is_taken
+        self._named: dict[str, tuple[str, str]] = {}
+        """The names of module and node of each ROS node."""
+        self._gateways: set[str] = set()
+        """The ROS nodes that are r2p modules with several links."""
+        self._instances: dict[str, int] = {}
+        """Their instances, as far as known."""
         self._dirty: dict[str, None] = {}
         self._generation = 0
         self._demand = Demand()
@@ -232,6 +249,7 @@ class RosDiscovery(DiscoveryProtocol):
                 self.modules[name] = msgspec.structs.replace(info, last_heard=now)
             for topic, role in self.peers:
                 self.topics[topic].set_heard(role, now)
+            return self._show_modules(now)
         return []
 
     def receive(self, now: int, data: bytes, source: PeerAddress = None) -> list[Event]:
@@ -256,7 +274,19 @@ class RosDiscovery(DiscoveryProtocol):
         changed = (key for key in before.keys() | self.peers.keys() if before.get(key) != self.peers.get(key))
         self._dirty |= dict.fromkeys(sorted({topic for topic, _ in changed}))
         self._mark_at = now + _MARK_EVERY if graph.nodes or self.peers else None
-        return self._set_modules(now, graph)
+        self._named = {node: self._names.module(node) for node in sorted(graph.nodes)[:TABLE_MAX]}
+        self._gateways = {each.node for each in graph.publishers if each.topic == GATEWAYS}
+        self._instances = {node: known for node, known in self._instances.items() if node in self._gateways}
+        events = self._show_modules(now)
+        self._set_endpoints()
+        return events
+
+    def set_instance(self, now: int, node: str, instance: int) -> list[Event]:
+        """Note which r2p module a ROS node is: it is on other networks, too, and must not look like another one."""
+        if node not in self._gateways or self._instances.get(node) == instance:
+            return []
+        self._instances[node] = instance
+        return self._show_modules(now)
 
     def _enter(self, now: int, role: int, endpoint: RosPeerEndpoint) -> None:
         if endpoint.topic == GATEWAYS:
@@ -277,29 +307,39 @@ class RosDiscovery(DiscoveryProtocol):
         self.topics[topic].set_heard(role, now)
         self._demand.add(topic, role, None)
 
-    def _set_modules(self, now: int, graph: RosGraph) -> list[Event]:
-        named = {node: self._names.module(node) for node in sorted(graph.nodes)[:TABLE_MAX]}
-        modules: dict[str, ModuleInfo] = {}
-        for node, (module, _) in named.items():
-            instance = name_hash(node) & 0xFFFFFFFF
-            is_tool = self._names.is_tool(node)
-            modules.setdefault(module, ModuleInfo(module, 0, now, instance, is_tool, FOR_EVER, source=node))
+    def _show_modules(self, now: int) -> list[Event]:
+        """Show the ROS nodes as modules, if anything about that has changed."""
+        modules = {info.name: info for info in self._modules(now)}
         gone = [info for name, info in self.modules.items() if name not in modules]
-        new = [info for name, info in modules.items() if name not in self.modules]
-        self.modules.clear()
-        self.modules.update(modules)
-        self._set_endpoints(named)
+        new = [info for name, info in modules.items() if self._instance_of(name) != info.instance]
+        if gone or new:
+            self.modules.clear()
+            self.modules.update(modules)
+            self._generation += 1
+            self._set_endpoints()
         return [*map(ModuleGone, gone), *map(ModuleChanged, new)]
 
-    def _set_endpoints(self, named: dict[str, tuple[str, str]]) -> None:
+    def _instance_of(self, module: str) -> int | None:
+        known = self.modules.get(module)
+        return None if known is None else known.instance
+
+    def _modules(self, now: int) -> Iterator[ModuleInfo]:
+        for node, (module, _) in reversed(self._named.items()):  # of several with one name the first counts
+            if node in self._gateways and node not in self._instances:
+                continue  # its first message says which module it is
+            instance = self._instances.get(node, name_hash(node) & 0xFFFFFFFF)
+            if not self._is_taken(module, instance):
+                yield ModuleInfo(module, 0, now, instance, self._names.is_tool(node), FOR_EVER, source=node)
+
+    def _set_endpoints(self) -> None:
         before = dict(self.endpoints)
         self.endpoints.clear()
         for (topic, role), peers in self.peers.items():
             for peer in peers:
-                if peer.node not in named or len(self.endpoints) >= TABLE_MAX:
+                module, node = self._named.get(peer.node, ("", ""))
+                instance = self._instance_of(module)
+                if instance is None or len(self.endpoints) >= TABLE_MAX:
                     continue
-                module, node = named[peer.node]
-                instance = self.modules[module].instance or 0
                 latches = CLASS_LATCHES if peer.qos is not None and peer.qos.transient_local else 0
                 key = instance, node, topic, role
                 self.endpoints[key] = EndpointInfo(module, *key, latches if role == ROLE_PUBLISHES else 0)

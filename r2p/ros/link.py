@@ -19,7 +19,7 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 
 from r2p.clock import in_background
-from r2p.codecs import management
+from r2p.codecs import UnknownType, management
 from r2p.codecs.management import GATEWAY_TYPES, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError, MessageError, TransportError
 from r2p.messages import SIZE_MAX, Len, Message, layout
@@ -100,7 +100,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.names = GraphNames(options, hub.space.module if hub.observer else "")
         name = unique_name(name, hub)
         counts = LoggedCounter(name, hub.space.clock)
-        self._ros = RosDiscovery(hub.space.module, hub.instance, self.names, self._review_safely, counts)
+        review, taken = self._review_safely, self._is_taken
+        self._ros = RosDiscovery(hub.space.module, hub.instance, self.names, review, taken, counts)
         super().__init__(name, hub, discovery=self._ros)
         middleware.lost = self.stats.lost
         self.off_ros: dict[str, str] = {}
@@ -391,7 +392,15 @@ class RosLink(BufferedLink, MiddlewareUser):
             super().receive_other(arrival)
             return
         decode = layout(GatewayMessage).decode if self.middleware.version == 1 else cdr(GatewayMessage).decode
-        self.manage(decode(arrival.data).data, arrival.node)
+        data = decode(arrival.data).data
+        if (instance := _sender_of(data)) is not None:
+            self._apply(self._ros.set_instance(self._clock.monotonic(), arrival.node, instance))
+        self.manage(data, arrival.node)
+
+    def _is_taken(self, name: str, instance: int) -> bool:
+        """Return whether another module has this name on another link."""
+        others = (each.discovery.modules.get(name) for each in self._space.links if each.name != self.name)
+        return any(info is not None and info.instance != instance for info in others)
 
     # In
 
@@ -511,6 +520,20 @@ class RosLink(BufferedLink, MiddlewareUser):
     def shut_down(self, node: str, reason: str) -> None:
         self._registrations.forget_node(node)
         self.notice("ROS node ended", f"{node} is no longer a ROS node here: {reason}", trouble=True)
+
+
+def _sender_of(data: bytes) -> int | None:
+    """Return the instance of the module that has sent a message between gateways; None for any other message."""
+    try:
+        message = management.decode(data)
+    except (DecodeError, UnknownType):
+        return None
+    match message:
+        case management.Bridge() | management.Mesh():
+            return message.gateway
+        case management.Leaf():
+            return message.module
+    return None
 
 
 def _topic_type(travel: RosTopic) -> TopicType:

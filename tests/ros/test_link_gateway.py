@@ -120,7 +120,9 @@ async def test_each_node_behind_the_gateway_as_a_ros_node(version: int) -> None:
 
 @both
 @pytest.mark.virtual_time
-async def test_two_gateways_between_the_same_networks_do_not_loop_and_one_replaces_the_other(version: int) -> None:
+async def test_two_gateways_between_the_same_networks_do_not_loop_and_one_replaces_the_other(
+    version: int, caplog: pytest.LogCaptureFixture
+) -> None:
     network, bus = FakeRosNetwork(version), Network()
     user = network.node("/user")
     received = user.subscribe("/speed", Speed)
@@ -136,6 +138,9 @@ async def test_two_gateways_between_the_same_networks_do_not_loop_and_one_replac
             await asyncio.sleep(0.05)
         assert [each.left for each in received] == list(range(20))
         assert [(await goals.fetch()).left for _ in range(len(goals.queue))] == list(range(20))
+        assert "carry the name" not in caplog.text
+        modules = base._space.links[0].discovery.modules
+        assert {name for name in modules if modules[name].instance is not None} == {"GW0", "GW1", "user"}
         states = {port.state for each in gateways for port in each.gateway_statistics().ports}
         assert "blocked" in states
         forwarding = next(
@@ -209,3 +214,20 @@ async def test_latched_values_pass_the_gateway(version: int) -> None:
         await asyncio.sleep(4)
         assert late == [Speed(2.0)]
         assert await maps.fetch() == Speed(7.0)
+
+
+@both
+@pytest.mark.virtual_time
+async def test_a_ros_node_with_the_name_of_a_module_is_not_taken_for_it(
+    version: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    network, bus = FakeRosNetwork(version), Network()
+    network.node("/BASE").advertise("/speed", Speed)
+    network.node("/lidar").advertise("/scan", Speed)
+    async with gateway("GW", bus, network) as module, bus.node("BASE"), bus.module("PC", observer=True) as tool:
+        await asyncio.sleep(6)
+        assert [each.name for each in tool.network.modules() if each.link] == ["BASE", "GW", "lidar"]
+        ros = module.links[1].discovery
+        assert set(ros.modules) == {"lidar"}
+        assert set(ros.topics) >= {"speed", "scan"}  # its topics are there all the same
+    assert "carry the name" not in caplog.text
