@@ -5,6 +5,7 @@ all declarations.
 """
 
 import asyncio
+import functools
 import random
 from typing import TYPE_CHECKING
 
@@ -106,10 +107,9 @@ class Ros2Middleware(Middleware):
                 if self._is_up():
                     continue
                 before, reason = reason, await self._diagnose(config)
-                may_try_again = (
-                    NOT_ADMITTED in reason and reason != before
-                )  # as zenoh does soon after a router's return
-                if not self._up and not may_try_again:
+                if NOT_ADMITTED in reason and reason != before:
+                    continue  # zenoh may be about to try again
+                if not self._is_up():
                     user.middleware_waits(reason)
 
     def _start(self, zenoh_session: ZenohSession, user: MiddlewareUser) -> None:
@@ -253,10 +253,15 @@ class Ros2Middleware(Middleware):
     def unsubscribe(self, endpoint: RosEndpoint) -> None:
         self._subscribed.pop(endpoint, None)
         subscription = self._subscriptions.get(_index(endpoint))
-        if subscription is not None:
+        if subscription is not None and self._session is not None:
             subscription.remove(endpoint)
-            if not subscription.tokens:
-                del self._subscriptions[_index(endpoint)]
+            self._session.later(functools.partial(self._close_unused, subscription, _index(endpoint)))
+
+    def _close_unused(self, subscription: RmwSubscription, index: tuple[str, str, str]) -> None:
+        """Close a subscription unless another subscriber has joined it: one that differs in its QoS misses nothing."""
+        if not subscription.tokens and self._subscriptions.get(index) is subscription:
+            del self._subscriptions[index]
+            subscription.close()
 
     def pause(self) -> None:
         if self._session is not None:

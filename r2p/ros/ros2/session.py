@@ -41,6 +41,7 @@ class RmwSession:
         """Bytes of messages that wait for the thread of large messages."""
         self.requests = OutboundThread(self.loop, lost.internal_error)
         """The thread that sends requests and responses: they wait for room, as in rmw_zenoh, or routers drop them."""
+        self._later: list[Callable[[], object]] = []
         self._ids = itertools.count(1)
         self._nodes: dict[str, int] = {}
         self._own: dict[tuple[EntityKind, str], dict[RmwToken, None]] = {}
@@ -61,8 +62,20 @@ class RmwSession:
         if number is not None:
             self.undeclare(RmwToken(self.domain, self.zid, number, number, EntityKind.NODE, node))
 
+    def later(self, function: Callable[[], object]) -> None:
+        """Call a function at the end of this turn of the loop, at the latest before the session is closed."""
+        self._later.append(function)
+        if len(self._later) == 1:
+            self.loop.call_soon(self._call_later)
+
+    def _call_later(self) -> None:
+        functions, self._later = self._later, []
+        for each in functions:
+            self.lost.guard(each)
+
     async def close(self) -> None:
         """Send what waits, and close the session."""
+        self._call_later()
         await asyncio.to_thread(self.requests.finish)
         await self.zenoh.close()
 

@@ -83,15 +83,22 @@ class RmwPublisher:
     @property
     def reaches_subscriber(self) -> bool:
         """Return whether zenoh knows a subscriber; what a transient local publisher sends is kept for it."""
-        if isinstance(self._publisher, zenoh.ext.AdvancedPublisher):
-            return True
+        if isinstance(self._publisher, zenoh.ext.AdvancedPublisher) or self._session.zenoh.outbound.uses_thread:
+            return True  # with very many tokens zenoh may take long to answer
         # The stubs of zenoh promise a bool; the result is an object with one, and is itself always true.
         status: object = self._publisher.matching_status
         return bool(getattr(status, "matching", status))
 
     def close(self) -> None:
-        """Undeclare the publisher; messages that wait are sent before."""
+        """Undeclare the publisher; messages that wait are sent before.
+
+        zenoh learns of it at the end of the turn. Until then a new publisher of the topic, with another QoS, finds its
+        way to subscribers at once, and loses nothing.
+        """
         self._session.undeclare(self.token)
+        self._session.later(self._undeclare)
+
+    def _undeclare(self) -> None:
         if self._waiting:
             self._large.submit(self._publisher.undeclare)
         else:
@@ -181,12 +188,10 @@ class RmwSubscription:
         return token
 
     def remove(self, endpoint: RosEndpoint) -> None:
-        """Remove a subscriber; with the last one the subscription ends."""
+        """Remove a subscriber."""
         token = self.tokens.pop(endpoint, None)
         if token is not None:
             self._session.undeclare(token)
-        if not self.tokens:
-            self.close()
 
     def close(self) -> None:
         """End the subscription."""

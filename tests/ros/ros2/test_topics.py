@@ -196,3 +196,27 @@ async def test_large_messages() -> None:
         a.publish("/a", "/chatter", image, 0)
         await user_b.until(lambda: len(user_b.arrivals) == 14)
         assert b.lost == {}
+
+
+async def test_a_change_of_qos_loses_and_repeats_nothing() -> None:
+    """A link withdraws an endpoint and registers the changed one in one turn, at any time."""
+    async with router() as network, joined(network) as (a, user_a), joined(network) as (b, user_b):
+        first, second = endpoint("/a"), endpoint("/a", transient_local=True, depth=1)
+        a.advertise(first)
+        b.subscribe(endpoint("/b"))
+        await user_a.until(lambda: "joined /chatter" in user_a.events)
+        a.publish("/a", "/chatter", b"1", 0)
+        a.withdraw(first)
+        a.advertise(second)
+        a.publish("/a", "/chatter", b"2", 0)
+        await user_b.until(lambda: len(user_b.arrivals) == 2)
+        b.unsubscribe(endpoint("/b"))
+        b.subscribe(endpoint("/b", transient_local=True))
+        a.publish("/a", "/chatter", b"3", 0)
+        await user_b.until(lambda: len(user_b.arrivals) == 3)
+        assert [each.data for each in user_b.arrivals] == [b"1", b"2", b"3"]
+        b.unsubscribe(endpoint("/b", transient_local=True))
+        await user_a.until(lambda: "gone /chatter" in user_a.events)
+        b.subscribe(endpoint("/b", transient_local=True))  # later: it is a new one, which gets the latched value
+        await user_b.until(lambda: len(user_b.arrivals) == 4)
+        assert user_b.arrivals[3].data == b"3"
