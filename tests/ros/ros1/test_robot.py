@@ -13,15 +13,17 @@ import r2p
 import r2p.sim
 from r2p.clock import clock_of
 from r2p.msg import Odometry, StampedIMU, Timestamp, Velocity3
+from r2p.ros.cdr import cdr
 from r2p.ros.middleware import RosArrival, RosEndpoint, RosType
 from r2p.ros.stamps import STAMP_OF_RECEPTION
-from r2p.ros.tf import odometry_tf
+from r2p.ros.tf import Vector3, odometry_tf
 from r2p.sim.robots.emulated import Triskar2
 from r2p.units import MILLISECOND, SECOND
 from tests.ros.ros1 import packages
 from tests.ros.ros2.network import joined, router
 
 if TYPE_CHECKING:
+    from r2p.ros.ros2.middleware import Ros2Middleware
     from tests.ros.ros1.programs import Ros1, RospyPeer
 
 pytestmark = [pytest.mark.xdist_group("ros1"), pytest.mark.processes]
@@ -36,6 +38,11 @@ LIMIT = 30.0
 GOAL = 0.3
 """m."""
 GAIN, FASTEST, NEAR = 1.2, 0.25, 0.004
+
+
+class Twist(r2p.Message, name="geometry_msgs/Twist"):
+    linear: Vector3 = Vector3()
+    angular: Vector3 = Vector3()
 
 
 async def drive(node: r2p.Node) -> None:
@@ -95,48 +102,64 @@ def test_a_rospy_node_in_virtual_time_stops_where_its_twin_in_r2p_does(ros1: Ros
     assert simulated > real
 
 
+async def gyroscope(node: r2p.Node, measured: dict[float, int]) -> None:
+    """Measure its own number, and stamp it with the time of the bus, which is all that firmware knows."""
+    imu = node.advertise("imu", StampedIMU)
+    async for _ in node.every(0.1):
+        if (time := node.network_time()) is not None:
+            measured[float(imu.sent)] = clock_of().now()
+            await imu.publish(StampedIMU(Timestamp.from_ns(time), yaw_rate=float(imu.sent)))
+
+
 def test_ros1_and_ros2_drive_a_robot_and_see_it(ros1: Ros1, rospy_peer: RospyPeer) -> None:
     """At once, by one gateway. What comes back has the stamps of the module on the bus that has measured it."""
     measured: dict[float, int] = {}
+    of_ros1: dict[int, Any] = {}
+    of_tf: dict[int, Any] = {}
 
-    async def gyroscope(node: r2p.Node) -> None:
-        """Measure the pace of time, and stamp it with the bus's time, which is all that firmware knows."""
-        imu = node.advertise("imu", StampedIMU)
-        async for _ in node.every(0.1):
-            if (time := node.network_time()) is not None:
-                measured[float(imu.sent)] = clock_of().now()
-                await imu.publish(StampedIMU(Timestamp.from_ns(time), yaw_rate=float(imu.sent)))
+    async def in_ros1(topic: str) -> Any:
+        return (await rospy_peer.do("messages", topic=topic))[0]["message"]
 
-    async def main() -> tuple[list[Any], list[Any], list[RosArrival]]:
+    async def drive_from_both(robot: Triskar2, ros2: Ros2Middleware) -> None:
+        arguments = ("--rate", "100", "/velocity", "geometry_msgs/Twist", "{linear: {x: 0.2}}")
+        async with ros1.running("rostopic", "pub", *arguments):
+            while await asyncio.sleep(0.1, robot.pose[0]) < 0.05:
+                pass
+        kind = full("geometry_msgs/Twist")
+        ros2.advertise(RosEndpoint("/here", "/velocity", RosType("geometry_msgs/Twist", ROS2.hash_rihs01(kind))))
+        while await asyncio.sleep(0.05, robot.pose[2]) < 0.2:
+            turn = Vector3(z=1.0)
+            ros2.publish("/here", "/velocity", cdr(Twist).encode(Twist(angular=turn)), clock_of().now())
+
+    async def main() -> list[RosArrival]:
         async with router() as network, joined(network, "/here") as (ros2, user):
             outside = [f"ros1:{ros1.uri}", f"ros2:{network.endpoint}"]
-            async with Triskar2("sim:robot", seed=1, outside=outside) as robot:
+            async with Triskar2("sim:robot", seed=1, outside=outside) as robot, asyncio.timeout(SLOW * LIMIT):
                 await robot.ready()
-                robot.modules["MOTOR2"].start(gyroscope)
+                robot.modules["MOTOR2"].start(gyroscope, measured)
                 robot.modules["GW"].start(odometry_tf)
                 for topic, kind in (("/odometry", "nav_msgs/Odometry"), ("/imu", "sensor_msgs/Imu")):
                     ros2.subscribe(RosEndpoint("/here", topic, RosType(kind, ROS2.hash_rihs01(full(kind)))))
                 await rospy_peer.do("subscribe", topic="/odometry", type="nav_msgs/Odometry")
                 await rospy_peer.do("subscribe", topic="/tf", type="tf2_msgs/TFMessage")
-                arguments = ("--rate", "100", "/velocity", "geometry_msgs/Twist", "{linear: {x: 0.2}}")
-                async with asyncio.timeout(SLOW * LIMIT), ros1.running("rostopic", "pub", *arguments):
-                    while await asyncio.sleep(0.1, robot.pose[0]) < 0.1:
-                        pass
-                odometry = await rospy_peer.do("messages", topic="/odometry", count=10)
-                transforms = await rospy_peer.do("messages", topic="/tf", count=10)
+                await drive_from_both(robot, ros2)
+                while len(of_ros1.keys() & of_tf.keys()) < 5:
+                    message, (transform,) = await in_ros1("/odometry"), (await in_ros1("/tf"))["transforms"]
+                    of_ros1[stamp(message["header"])] = message["pose"]["pose"]["position"]
+                    of_tf[stamp(transform["header"])] = transform["transform"]["translation"]
                 assert not any(link.stats.faults[STAMP_OF_RECEPTION] for link in robot.modules["GW"].links)
-                return odometry, transforms, user.arrivals
+                return user.arrivals
 
-    odometry, transforms, arrivals = r2p.sim.run(main, speed=SLOW)
+    arrivals = r2p.sim.run(main, speed=SLOW)
     for topic in ("/odometry", "/tf"):
         asyncio.run(rospy_peer.do("unsubscribe", topic=topic))
     assert asyncio.run(rospy_peer.do("get_param", name="/use_sim_time")) is None  # later nodes have real time again
-    of_ros1 = {stamp(each["message"]["header"]): pose(each["message"]["pose"]) for each in odometry}
-    of_tf = {stamp(each["header"]): pose(each) for (each,) in (each["message"]["transforms"] for each in transforms)}
-    of_ros2 = [decoded(each, "nav_msgs/Odometry") for each in arrivals if each.topic == b"/odometry"]
-    assert len(of_ros1.keys() & of_tf.keys()) > 5
     assert all(of_ros1[each] == of_tf[each] for each in of_ros1.keys() & of_tf.keys())
-    assert len({stamp(vars(each.header)) for each in of_ros2} & of_ros1.keys()) > 5
+    of_ros2 = [decoded(each, "nav_msgs/Odometry") for each in arrivals if each.topic == b"/odometry"]
+    seen = {stamp(vars(each.header)): each.pose.pose.position for each in of_ros2}
+    both = seen.keys() & of_ros1.keys()
+    assert len(both) > 3
+    assert {each: seen[each].x for each in both} == {each: of_ros1[each]["x"] for each in both}
     readings = [decoded(each, "sensor_msgs/Imu") for each in arrivals if each.topic == b"/imu"]
     assert len(readings) > 5
     for each in readings:
@@ -156,8 +179,3 @@ def stamp(header: dict[str, Any]) -> int:
     found = header["stamp"]
     sec, nsec = found.values() if isinstance(found, dict) else (found.sec, found.nanosec)
     return int(sec) * SECOND + int(nsec)
-
-
-def pose(message: dict[str, Any]) -> Any:
-    """The position in a message of odometry, or in a transform."""
-    return message["transform"]["translation"] if "transform" in message else message["pose"]["position"]
