@@ -17,6 +17,7 @@ from r2p.ros.std_srvs import SetBool
 from r2p.testing.network import node_in
 from tests.ros.ros2.network import RouterOfTests, router
 from tests.ros.test_actions import Count, count
+from tests.ros.test_type_descriptions import Cart
 
 pytestmark = pytest.mark.anyio
 LIMIT = 20.0
@@ -124,3 +125,18 @@ async def test_goals_and_commands() -> None:
         )
         output, _ = await call.communicate()
         assert (call.returncode, json.loads(output)) == (0, {"success": True, "message": "as you wish"})
+
+
+async def test_a_tool_learns_a_type_from_its_node() -> None:
+    """By the service `get_type_description` of the node, as tools of ROS do it."""
+    async with (
+        asyncio.timeout(LIMIT),
+        router() as network,
+        node_on(network, "robot") as node,
+        r2p.Module("TOOL", via=f"ros2:{network.endpoint}", observer=True) as tool,
+    ):
+        node.advertise("cart", Cart)
+        wanted = r2p.layout(Cart)
+        while (found := await tool.links[0].message_type(wanted.fingerprint)) is None:  # noqa: ASYNC110 - no event
+            await asyncio.sleep(0.01)
+        assert (r2p.layout(found).name, r2p.layout(found).schema) == (wanted.name, wanted.schema)
