@@ -259,7 +259,8 @@ class NetworkView:
         return None if view is None else view.instance
 
     def _view(self, module: str) -> ModuleView | None:
-        return min((each for each in self.modules() if each.name == module), key=lambda each: each.age, default=None)
+        found = (each for each in self.modules() if each.name == module)
+        return min(found, key=lambda each: (each.kind == "ROS", each.age), default=None)  # it may be seen as both
 
 
 def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:

@@ -11,8 +11,10 @@ tf            transforms, /tf
 library       the definitions that come with ROS, and what the ends of a connection compare of a type
 source        Python source of message classes
 packages      packages for ROS with the types of r2p's classes
-link          a link to a ROS network; discovery, registrations: what is there, and what this side has there
-topics        how topics travel; topic_classes, graph_names, qos, options: their types, names and quality of service
+link          a link to a ROS network; discovery, registrations: what is there, and what this side has there; gateways:
+              how those on ROS find each other
+topics        how topics travel; topic_classes, graph_names, qos, options: their types, names and quality of service;
+              background: what is computed in a thread
 middleware    the seam to ROS 1, rmw_zenoh or DDS
 service_types   types of services in ROS; std_srvs: those that every ROS has
 services        services between r2p and ROS nodes; service_calls: from a request to its answer

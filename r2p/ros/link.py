@@ -6,31 +6,27 @@
 `RosDiscovery` has what other ROS nodes publish and subscribe to, and calls `_review` for each topic that changes. With
 its class known (`TopicClasses`), and so how it travels (`RosTopic`), it is registered at the middleware
 (`Registrations`), as that of ROS nodes.
-
-Gateways find each other by their own messages, on a topic of their own: two of them that join the same networks would
-otherwise pass each message on for ever.
 """
 
 import asyncio
 import functools
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import msgspec
 
 from r2p.clock import in_background
-from r2p.codecs import UnknownType, management
-from r2p.codecs.management import GATEWAY_TYPES, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError, MessageError, TransportError
-from r2p.messages import SIZE_MAX, Len, Message, layout
+from r2p.messages import SIZE_MAX, Message, layout
 from r2p.names import LOG, SERVICE_SUFFIXES
 from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import TopicType
 from r2p.ros import type_descriptions
 from r2p.ros.background import BackgroundResults
-from r2p.ros.cdr import cdr
 from r2p.ros.clock import publishes_clock, ros_time
 from r2p.ros.discovery import GATEWAYS, RosDiscovery
+from r2p.ros.gateways import GatewayExchange, sender_of
 from r2p.ros.graph_names import GraphNames
 from r2p.ros.library import load_definitions
 from r2p.ros.middleware import (
@@ -38,20 +34,18 @@ from r2p.ros.middleware import (
     Cancel,
     Middleware,
     MiddlewareUser,
-    Qos,
     Refuse,
     RosArrival,
     RosEndpoint,
     RosGraph,
     RosPeerEndpoint,
-    RosType,
 )
 from r2p.ros.options import RosOptions, lookup, merged
 from r2p.ros.qos import publisher_qos, subscriber_qos
 from r2p.ros.registrations import Registrations
 from r2p.ros.services import RosServices, ServiceArrival
 from r2p.ros.topic_classes import TopicClasses
-from r2p.ros.topics import RosTopic, TopicTypes, is_own, ros_type
+from r2p.ros.topics import RosTopic, TopicTypes, is_own
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.buffered_link import BufferedLink
@@ -60,19 +54,12 @@ from r2p.transports.stats import LoggedCounter
 from r2p.transports.url import open_transport
 
 _GATEWAYS_KEY = GATEWAYS.encode()
-_GATEWAYS_QOS = Qos(depth=100)
 _OFF_ROS_AFTER_S = 3.0  # from when a topic is not on ROS until that is reported: its type may be on its way
 
 _UNKNOWN = "type unknown"
 _NOT_ON_ROS = "not on ROS"
 _NOTHING = TopicType(), TopicType()
 _ROLES = (ROLE_PUBLISHES, ROLE_SUBSCRIBES)
-
-
-class GatewayMessage(Message, name="r2p_msgs/GatewayMessage"):
-    """A message between gateways, which has the same bytes on all links."""
-
-    data: Annotated[bytes, Len(management.SIZE)]
 
 
 class _Published(msgspec.Struct, frozen=True, eq=False):
@@ -127,7 +114,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._reported: set[str] = set()
         """Topics that were reported as not on ROS."""
         self._sources: dict[str, Source] = {}
-        self._gateways: RosType | None = None
+        self._gateways = GatewayExchange(middleware, self._registrations, hub.space.clock)
 
     # Own topics
 
@@ -147,7 +134,8 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def _review(self, topic: str) -> None:
         """Register a topic as it is now used, or remove it."""
-        self._join_gateways()
+        if self._ros.is_gateway or len(self._space.links) > 1:
+            self._gateways.join()
         if self._is_service(topic):
             self._apply(self.services.review(topic))
             return
@@ -366,34 +354,17 @@ class RosLink(BufferedLink, MiddlewareUser):
             self.middleware.publish(node, published.name, data, sample.stamp)
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        """Send what gateways say to each other; for everything else ROS nodes have no use."""
-        if self._gateways is not None and management.type_of(data) in GATEWAY_TYPES:
-            message = GatewayMessage(data)
-            packed = message.encode() if self.middleware.version == 1 else cdr(GatewayMessage).encode(message)
-            self.middleware.publish(self._registrations.module_node, GATEWAYS, packed, self._clock.now())
+        self._gateways.send(data)
 
     def write_call(self, data: bytes, to: Hashable) -> None:
         """Do nothing: ROS nodes have no use for it."""
-
-    # Gateways
-
-    def _join_gateways(self) -> None:
-        """Take part in the exchange of gateways' messages, from when the module is a gateway, or has other links."""
-        if self._gateways is not None or not (self._ros.is_gateway or len(self._space.links) > 1):
-            return
-        self._gateways = kind = ros_type(GatewayMessage, self.middleware.version)
-        self._registrations.keep_module_node()
-        endpoint = RosEndpoint(self._registrations.module_node, GATEWAYS, kind, _GATEWAYS_QOS)
-        for role in _ROLES:
-            self._registrations.declare(GATEWAYS, role, {endpoint})
 
     def receive_other(self, arrival: Any) -> None:
         if arrival.topic != _GATEWAYS_KEY:
             super().receive_other(arrival)
             return
-        decode = layout(GatewayMessage).decode if self.middleware.version == 1 else cdr(GatewayMessage).decode
-        data = decode(arrival.data).data
-        if (instance := _sender_of(data)) is not None:
+        data = self._gateways.decode(arrival.data)
+        if (instance := sender_of(data)) is not None:
             self._apply(self._ros.set_instance(self._clock.monotonic(), arrival.node, instance))
         self.manage(data, arrival.node)
 
@@ -520,20 +491,6 @@ class RosLink(BufferedLink, MiddlewareUser):
     def shut_down(self, node: str, reason: str) -> None:
         self._registrations.forget_node(node)
         self.notice("ROS node ended", f"{node} is no longer a ROS node here: {reason}", trouble=True)
-
-
-def _sender_of(data: bytes) -> int | None:
-    """Return the instance of the module that has sent a message between gateways; None for any other message."""
-    try:
-        message = management.decode(data)
-    except (DecodeError, UnknownType):
-        return None
-    match message:
-        case management.Bridge() | management.Mesh():
-            return message.gateway
-        case management.Leaf():
-            return message.module
-    return None
 
 
 def _topic_type(travel: RosTopic) -> TopicType:

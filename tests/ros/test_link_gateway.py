@@ -139,6 +139,7 @@ async def test_two_gateways_between_the_same_networks_do_not_loop_and_one_replac
         assert [each.left for each in received] == list(range(20))
         assert [(await goals.fetch()).left for _ in range(len(goals.queue))] == list(range(20))
         assert "carry the name" not in caplog.text
+        assert (await gateways[0].network.statistics("GW1")).links  # by the bus, though it is a ROS node as well
         modules = base._space.links[0].discovery.modules
         assert {name for name in modules if modules[name].instance is not None} == {"GW0", "GW1", "user"}
         states = {port.state for each in gateways for port in each.gateway_statistics().ports}
