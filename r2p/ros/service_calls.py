@@ -10,7 +10,7 @@ body, and go out by `send(topic, data, lifetime)`.
 import asyncio
 from collections import Counter
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import msgspec
 
@@ -21,6 +21,7 @@ from r2p.errors import DecodeError, Error, MessageError
 from r2p.ros.middleware import Answer, Cancel, Middleware, Refuse
 from r2p.ros.service_types import RosServiceCodec
 from r2p.services.answers import RememberedAnswers
+from r2p.services.server import Handling, ServiceServer
 from r2p.services.servers import KnownServers
 from r2p.units import MILLISECOND, SECOND
 
@@ -45,7 +46,7 @@ class CarriedService(msgspec.Struct, eq=False):
     """A service of r2p on the ROS network: `serves` if ROS nodes may call it, `calls` if it has clients here.
 
     `servers` are those in other modules, of r2p or ROS. `node` is the ROS node in whose name clients here call;
-    `target` the instance of the module that handles requests of ROS nodes, 0: any; `is_local` if it is this one.
+    `target` the instance of the module that handles requests of ROS nodes, 0: any.
     """
 
     name: str
@@ -56,7 +57,6 @@ class CarriedService(msgspec.Struct, eq=False):
     calls: bool = False
     node: str = ""
     target: int = 0
-    is_local: bool = False
 
     @property
     def request_size(self) -> int:
@@ -173,6 +173,7 @@ class _OpenRequest(msgspec.Struct, eq=False):
     """A request of a ROS node. `kind` is CANCEL once its caller is gone; `tries` cancellations are still sent.
 
     `repeat_at` is when it is sent again (monotonic ns, 0: never), `pause` the time to the repetition after that one.
+    One for a server of this module is not sent: `handling` is what that makes of it.
     """
 
     service: CarriedService
@@ -184,6 +185,7 @@ class _OpenRequest(msgspec.Struct, eq=False):
     tries: int = _CANCELS
     repeat_at: int = 0
     pause: int = _REPEAT
+    handling: Handling | None = None
 
 
 class RosRequests:
@@ -203,8 +205,15 @@ class RosRequests:
         self._last = 0
         self._alarm = Alarm(loop, self._due, background=True)
 
-    def begin(self, service: CarriedService, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
-        """Send a request to the server; return the function that cancels it."""
+    def begin(
+        self,
+        service: CarriedService,
+        request: bytes,
+        answer: Answer,
+        refuse: Refuse,
+        server: ServiceServer[Any, Any] | None = None,
+    ) -> Cancel:
+        """Send a request to the server, or hand it to this one of this module; return the function that cancels it."""
         if len(self._open) >= OPEN_MAX:
             self._lost[_TOO_MANY] += 1
             refuse(f"{OPEN_MAX} requests wait for their answers: call again later")
@@ -217,20 +226,40 @@ class RosRequests:
             return _nothing_to_cancel
         number = self._next_number(service.name)
         made = self._open[service.name, number] = _OpenRequest(service, number, body, answer, refuse)
-        self._transmit(made)
+        if server is None:
+            self._transmit(made)
+        else:
+            self._submit(made, server)
         return lambda: self._cancel(made)
+
+    def _submit(self, request: _OpenRequest, server: ServiceServer[Any, Any]) -> None:
+        """Hand a request to a server of this module: the text of an error arrives whole, however short answers are."""
+        try:
+            message = request.service.codec.shape.request.decode(request.body)
+        except DecodeError as error:
+            self._lost["undecodable"] += 1
+            self._finish(request.service.name, request.number, Kind.ERROR, str(error).encode())
+            return
+
+        def reply(_handling: Handling, kind: Kind, _response: object, data: bytes) -> None:
+            self._finish(request.service.name, request.number, kind, data)
+
+        request.handling = server.submit(request, message, reply)
 
     def receive(self, service: CarriedService, header: ServiceHeader, body: bytes) -> None:
         """Handle an answer, which may be for another caller."""
-        if header.instance != self.instance or header.kind is Kind.WORKING:
-            return
-        found = self._open.pop((service.name, header.number), None)
+        if header.instance == self.instance and header.kind is not Kind.WORKING:
+            self._finish(service.name, header.number, header.kind, body)
+
+    def _finish(self, name: str, number: int, kind: Kind, body: bytes) -> None:
+        """Answer a request, unless it was cancelled."""
+        found = self._open.pop((name, number), None)
         if found is None or found.kind is Kind.CANCEL:
             return
-        if header.kind is Kind.RESPONSE:
+        if kind is Kind.RESPONSE:
             self._respond(found, body)
-        elif header.kind is Kind.BUSY:
-            found.refuse(f"{service.ros_name} is busy: call again later")
+        elif kind is Kind.BUSY:
+            found.refuse(f"{found.service.ros_name} is busy: call again later")
         else:
             found.refuse(services.decode_text(body) or "it failed; its log says why")
 
@@ -249,6 +278,8 @@ class RosRequests:
             found = self._open.pop(key)
             if found.kind is Kind.REQUEST:
                 found.refuse(reason)
+            if found.handling is not None:
+                found.handling.cancel(reason)
 
     def close(self) -> None:
         """Refuse all requests: the link ends."""
@@ -259,7 +290,10 @@ class RosRequests:
     def _cancel(self, request: _OpenRequest) -> None:
         if self._open.get((request.service.name, request.number)) is request and request.kind is Kind.REQUEST:
             request.kind, request.pause = Kind.CANCEL, _CANCEL_PAUSE
-            self._transmit(request)
+            if request.handling is not None:
+                request.handling.cancel("cancelled by its caller")
+            else:
+                self._transmit(request)
 
     def _next_number(self, name: str) -> int:
         """Return a number that no open request for the service has; fewer than all of them are open."""
@@ -280,12 +314,11 @@ class RosRequests:
         if request.kind is Kind.CANCEL:
             request.tries -= 1
             body = b""
-            if not request.tries or service.is_local:
+            if not request.tries:
                 del self._open[service.name, request.number]
-        if not service.is_local:
-            request.repeat_at = self._clock.monotonic() + request.pause
-            request.pause = min(request.pause * 3 // 2, _REPEAT_MAX)
-            self._set_alarm()
+        request.repeat_at = self._clock.monotonic() + request.pause
+        request.pause = min(request.pause * 3 // 2, _REPEAT_MAX)
+        self._set_alarm()
         data = services.pack(self.instance, request.number, request.kind, service.target, body, service.request_size)
         self._send(service.name + REQUESTS, data, 0)
 

@@ -1,7 +1,8 @@
 """The services of r2p on a ROS network, in both roles: each is two topics here, NAME_q and NAME_r, and `/NAME` there.
 
-    client here   its message on NAME_q, for the link to write  ->  RosCalls  ->  a server of a ROS node
-    server here   a request of a ROS node  ->  RosRequests  ->  NAME_q; and its message on NAME_r, for the link to write
+    client here               its message on NAME_q, for the link to write  ->  RosCalls  ->  a server of a ROS node
+    server of this module     a request of a ROS node  ->  RosRequests  ->  ServiceServer.submit
+    server behind a gateway   the same  ->  RosRequests  ->  NAME_q; its answer on NAME_r is for the link to write
 
 For modules here, a server of a ROS node is one that subscribes to NAME_q and publishes NAME_r: so discovery shows it,
 clients find it, and gateways pass its service on. Services that each node of ROS has, for its parameters and its log,
@@ -40,6 +41,7 @@ from r2p.ros.service_calls import UNKNOWN_LIFETIME, CarriedService, RosCalls, Ro
 from r2p.ros.service_types import RosServiceCodec, ServiceShape, service_codec, service_shape, service_type
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.services.definition import Definition, define
+from r2p.services.server import server_of
 from r2p.services.servers import KnownServers
 from r2p.transports.link import Hub
 from r2p.units import MILLISECOND
@@ -90,7 +92,6 @@ class RosServices:
         """The services of this side that are not on the ROS network, and why."""
         self._link = link
         self._space = hub.space
-        self._own_instance = hub.instance
         self._discovery = discovery
         self._registrations = registrations
         loop, clock = hub.space.loop, hub.space.clock
@@ -153,7 +154,6 @@ class RosServices:
         elif service.serves and not served:
             self._requests.end(name, f"{ros_name} is not served any more")
         service.calls, service.serves = called, served
-        service.is_local = bool(self._discovery.own_nodes.get((name + REQUESTS, ROLE_SUBSCRIBES)))
         self._register(service)
         events = self._connect(name, called=called and self._has_fitting_server(service), served=served)
         if called and any(each.service == ros_name and _is_of_each_node(each) for each in self._graph.servers):
@@ -223,9 +223,7 @@ class RosServices:
         )
 
     def _target(self, service: CarriedService) -> int:
-        """Return the instance of the module that handles requests of ROS nodes: this one, else the nearest; 0: any."""
-        if service.is_local:
-            return self._own_instance
+        """Return the instance of the nearest other module with a server, for a request of a ROS node; 0: any."""
         here = self._ros_instances()
         return next((each.instance for each, _ in service.servers.find() if each.instance not in here), 0)
 
@@ -312,8 +310,11 @@ class RosServices:
         if service is None or not service.serves:
             refuse(f"{ros_name} is not served here any more")
             return _nothing_to_cancel
-        service.target = self._target(service)
-        return self._requests.begin(service, request, answer, refuse)
+        topic = self._space.topics.get(service.name + REQUESTS)
+        server = None if topic is None else server_of(topic.queues)
+        if server is None:
+            service.target = self._target(service)
+        return self._requests.begin(service, request, answer, refuse, server)
 
     def sample(self, arrival: ServiceArrival) -> Sample:
         """Return the sample of a message that goes to this module."""
