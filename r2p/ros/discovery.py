@@ -79,6 +79,8 @@ class RosDiscovery(DiscoveryProtocol):
         self._named: dict[str, tuple[str, str]] = {}
         """The names of module and node of each ROS node."""
         self._gateways: set[str] = set()
+        self.hears_gateways = False
+        """True on a link that takes part in what gateways say to each other."""
         """The ROS nodes that are r2p modules with several links."""
         self._instances: dict[str, int] = {}
         """Their instances, as far as known."""
@@ -325,7 +327,7 @@ class RosDiscovery(DiscoveryProtocol):
 
     def _modules(self, now: int) -> Iterator[ModuleInfo]:
         for node, (module, _) in reversed(self._named.items()):  # of several with one name the first counts
-            if node in self._gateways and node not in self._instances:
+            if self.hears_gateways and node in self._gateways and node not in self._instances:
                 continue  # its first message says which module it is
             instance = self._instances.get(node, name_hash(node) & 0xFFFFFFFF)
             if not self._is_taken(module, instance):

@@ -135,6 +135,7 @@ class RosLink(BufferedLink, MiddlewareUser):
     def _review(self, topic: str) -> None:
         """Register a topic as it is now used, or remove it."""
         if self._ros.is_gateway or len(self._space.links) > 1:
+            self._ros.hears_gateways = True
             self._gateways.join()
         if self._is_service(topic):
             self._apply(self.services.review(topic))

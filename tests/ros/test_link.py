@@ -17,7 +17,7 @@ from r2p.ros.link import ros_transport
 from r2p.ros.middleware import Qos, RosType
 from r2p.ros.options import QosChange, RosOptions, namespace, qos_change
 from r2p.ros.topics import ros_class
-from r2p.testing.network import node_in
+from r2p.testing.network import Network, node_in
 from tests.ros.fake import FakeRosNetwork
 
 both = pytest.mark.parametrize("version", [1, 2])
@@ -432,3 +432,15 @@ def test_options() -> None:
         ros_transport("memory:lab", RosOptions())
     transport = ros_transport(FakeRosNetwork().transport(ns="/a"), RosOptions(types={"x": Speed}))
     assert transport.options == RosOptions(ns="/a", types={"x": Speed})
+
+
+@both
+@pytest.mark.virtual_time
+async def test_a_gateway_is_a_module_for_those_that_are_none(version: int) -> None:
+    """A program and a tool hear nothing of what gateways say to each other."""
+    network, bus = FakeRosNetwork(version), Network()
+    gateway = r2p.Module("GW", via=[bus.transport(), network.transport(types={"speed": Speed})], bridge=True)
+    async with gateway, bus.node("MOTOR") as motor, r2p.Module("PC1", via=network.transport()) as pc:
+        motor.advertise("speed", Speed)
+        await asyncio.sleep(3.0)
+        assert "GW" in {each.name for each in pc.network.modules()}
