@@ -68,7 +68,7 @@ class MasterSession:
         self.host = address.host or "127.0.0.1"
         """The host by which others reach this computer, as far as that is known."""
         self.ends_without_nodes: Callable[[], bool] = lambda: False
-        """Returns whether to end, with Broken, when another node has taken the name of the only node."""
+        """Returns whether to end, with Broken, when the only node was ended by another one, or by `rosnode kill`."""
         self._broken = ""
         self._user: MiddlewareUser | None = None
         self._nodes: dict[str, SlaveNode] = {}
@@ -192,7 +192,7 @@ class MasterSession:
     async def run(self, user: MiddlewareUser, opened: Callable[[], object]) -> None:
         """Stay registered until cancelled; then unregister everything, and close the slave servers.
 
-        Raises Broken if the name of the only node was taken, and the session is to end then.
+        Raises Broken if the only node was ended, and the session is to end then.
         """
         self._user = user
         opened()
@@ -390,12 +390,12 @@ class MasterSession:
             answer = await self.client.call(uri, "getPid", node, timeout=_ASK_S)
             process = f" (process {value_of('getPid', answer)!r:.20})"
         reason = f"another node has taken its name, at {uri}{process}: give one of them another name"
-        if self._nodes.keys() == {node} and self.ends_without_nodes():
-            self._broken = f"{node} is no longer a ROS node: {reason}"
-            self._touch()
         await self._end_asked(node, reason)
 
     async def _end_asked(self, node: str, reason: str) -> None:
+        if self._nodes.keys() == {node} and self.ends_without_nodes():
+            self._broken = f"{node} is no longer a ROS node: {reason}"
+            self._touch()
         if node in self._nodes and self._user is not None:
             self.remove_node(node)
             self._user.shut_down(node, reason)

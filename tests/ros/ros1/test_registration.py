@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
 
-from r2p.errors import NoServer
+from r2p.errors import Broken, NoServer
 from r2p.ros.middleware import RosPeerEndpoint
 from r2p.ros.ros1 import registration
+from r2p.ros.ros1.environment import RosAddress
 from r2p.ros.ros1.master import MasterClient, MasterError
+from r2p.ros.ros1.registration import MasterSession
 from r2p.ros.ros1.slave import BusConnection, request_topic
 from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError
 from tests.ports import free_port
-from tests.ros.ros1.session import running
+from tests.ros.ros1.session import Recorder, running
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -128,6 +131,19 @@ async def test_rosnode_kill(ros1: Ros1, master: MasterClient) -> None:
         assert await recorder.event("shut_down") == ("shut_down", "/victim", "/rosnode asked for it: user request")
         while "/spin" in (await master.get_system_state("/test")).publishers:
             pass
+
+
+async def test_a_program_with_nothing_but_a_node_ends_with_that(ros1: Ros1) -> None:
+    recorder = Recorder()
+    session = MasterSession(RosAddress(ros1.uri, "127.0.0.1", "127.0.0.1"), recorder, Counter())
+    session.ends_without_nodes = lambda: True
+    session.add_node("/victim")
+    session.advertise("/victim", "/spin", STRING)
+    running_session = asyncio.create_task(session.run(recorder, lambda: None))
+    await recorder.event("up")
+    session.shutdown_asked("/victim", "/rosnode", "user request")
+    with pytest.raises(Broken, match="/victim is no longer a ROS node: /rosnode asked for it"):
+        await running_session
 
 
 async def test_a_master_that_dies_and_returns(own_ros1: Ros1) -> None:
