@@ -39,7 +39,7 @@ from r2p.ros.action_types import (
     action_types,
 )
 from r2p.runtime.node import Node
-from r2p.services.server import HandlerOwner
+from r2p.services.server import HandlerOwner, ServiceServer
 from r2p.units import SECOND
 
 LIMIT = 8
@@ -142,21 +142,20 @@ class ActionServer(HandlerOwner, Generic[G, R, F]):
         self._closed = False
         self._log_limit = LineLimit(_LOG_LINES)
         node.services[self] = None  # before its services: it ends before them
+        self._feedback = node.advertise(f"{self.name}/{FEEDBACK}", self.types.feedback_message)
+        self._status = node.advertise(f"{self.name}/{STATUS}", GoalStatusArray, latch=True)
+        self._services: list[ServiceServer[Any, Any]] = []
         try:
-            self._open()
+            self._serve()
         except BaseException:
-            node.forget(self)
+            self.close()
             raise
 
-    def _open(self) -> None:
-        node, types, name = self._node, self.types, self.name
-        self._feedback = node.advertise(f"{name}/{FEEDBACK}", types.feedback_message)
-        self._status = node.advertise(f"{name}/{STATUS}", GoalStatusArray, latch=True)
-        self._services = [
-            node.serve(f"{name}/{GET_RESULT}", types.get_result, self._get_result, limit=_ASKING_MAX),
-            node.serve(f"{name}/{CANCEL_GOAL}", CancelGoal, self._cancel_goal),
-            node.serve(f"{name}/{SEND_GOAL}", types.send_goal, self._send_goal),
-        ]
+    def _serve(self) -> None:
+        serve, types, name = self._node.serve, self.types, self.name
+        self._services.append(serve(f"{name}/{GET_RESULT}", types.get_result, self._get_result, limit=_ASKING_MAX))
+        self._services.append(serve(f"{name}/{CANCEL_GOAL}", CancelGoal, self._cancel_goal))
+        self._services.append(serve(f"{name}/{SEND_GOAL}", types.send_goal, self._send_goal))
 
     @property
     def running(self) -> list[ServerGoal[G, R, F]]:

@@ -14,6 +14,7 @@ from typing import Any, Protocol, cast
 
 import msgspec
 
+from r2p.clock import in_background
 from r2p.codecs import services
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.codecs.services import HEADER_SIZE, REQUESTS, RESPONSES, ServiceHeader
@@ -51,6 +52,9 @@ _OF_EACH_NODE = frozenset({"rcl_interfaces", "type_description_interfaces", "ros
 _OF_EACH_NODE_OF_ROS1 = ("/get_loggers", "/set_logger_level")
 """How these services end where types are not known."""
 
+_UNKNOWN = "type unknown"
+_OFF_ROS_AFTER_S = 2.0
+"""Seconds after which it is said of a service that it is not on ROS: until then its type may be learnt."""
 _NOTICES_MAX = 256
 """Different notices of one link; further ones are left out."""
 
@@ -210,9 +214,8 @@ class RosServices:
         return bool(fitting)
 
     def _report_type(self, service: CarriedService, server: RosPeerEndpoint) -> None:
-        if (server.node, service.name) in self._noticed:
+        if not self._may_notice(server.node, service.name):
             return
-        self._noticed.add((server.node, service.name))
         mine = service.codec.type
         differs = f"{server.type}, here it is {mine.name}" if server.type != mine.name else f"another {mine.name}"
         self._link.notice(
@@ -241,15 +244,32 @@ class RosServices:
         try:
             layouts = self._layouts(name)
             codec = None if layouts is None else _codec_of(*layouts, self._link.middleware.version)
-            reason = "type unknown" if layouts is None else ""
+            reason = _UNKNOWN if layouts is None else ""
         except MessageError as error:
             codec, reason = None, str(error)
         if not reason:
             self.off_ros.pop(name, None)
-        elif self.off_ros.get(name) != reason:
-            self.off_ros[name] = reason
-            self._discovery.counts["service not on ROS"] += 1
+            return codec
+        if name not in self.off_ros:
+            in_background(self._space.loop.call_later(_OFF_ROS_AFTER_S, self._report_off_ros, name))
+        self.off_ros[name] = reason
         return codec
+
+    def _report_off_ros(self, name: str) -> None:
+        """Report and count a service that is not on the ROS network, if it stayed so."""
+        reason = self.off_ros.get(name)
+        if reason is None or not self._may_notice("not on ROS", name):
+            return
+        self._discovery.counts["service not on ROS"] += 1
+        advice = f": give --type {name}=TYPE" if reason == _UNKNOWN else ""
+        self._link.notice("not on ROS", f"service {name} is not on ROS: {reason}{advice}", trouble=False)
+
+    def _may_notice(self, kind: str, what: str) -> bool:
+        """Return whether this was not said yet, as long as not too much was."""
+        is_new = (kind, what) not in self._noticed and len(self._noticed) < _NOTICES_MAX
+        if is_new:
+            self._noticed.add((kind, what))
+        return is_new
 
     def _layouts(self, name: str) -> tuple[Layout[Any], Layout[Any]] | None:
         """Return the layouts of both topics: those of this module's node, else from the options."""
@@ -337,8 +357,7 @@ class RosServices:
 
     def _report(self, service: CarriedService, text: str) -> None:
         """Report an error whose text does not reach the caller: an answer of its fixed length has no room for it."""
-        if (service.name, text) not in self._noticed and len(self._noticed) < _NOTICES_MAX:
-            self._noticed.add((service.name, text))
+        if self._may_notice(service.name, text):
             self._link.notice("call failed", f"service {service.name} of a ROS node: {text}", trouble=True)
 
 

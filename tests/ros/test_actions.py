@@ -305,8 +305,10 @@ def test_mistakes() -> None:
             with pytest.raises(r2p.InvalidName):
                 ActionClient(node, "a b", Count)
             ActionServer(node, "count", Count, count)
+            ends = len(node.services), len(node.publishers)
             with pytest.raises(r2p.Error, match="is already served by node"):
                 ActionServer(node, "count", Count, count)
+            assert (len(node.services), len(node.publishers)) == ends
             client = ActionClient(node, "count", Count)
             with pytest.raises(r2p.MessageError, match="action count takes Goal, not Result"):
                 await client.send(Count.Result())  # type: ignore[arg-type]

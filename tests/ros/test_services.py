@@ -212,15 +212,30 @@ async def test_through_a_gateway(version: int, loss: float) -> None:
 
 @pytest.mark.virtual_time
 async def test_what_does_not_fit_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    class Grid(r2p.Service):
+        class Request(r2p.Message):
+            cells: Annotated[tuple[Annotated[tuple[r2p.u8, ...], r2p.Len(2)], ...], r2p.Len(2)] = ((0, 0), (0, 0))
+
+        class Response(r2p.Message):
+            cells: r2p.u8 = 0
+
+    async def grid(request: Grid.Request) -> Grid.Response:
+        return Grid.Response()
+
+    caplog.set_level("INFO")
     network = FakeRosNetwork(2)
     peer = Peer(network.node("/server"), Divide)
     peer.serve("/divide", divide, checksum="RIHS01_0")
-    Peer(peer.node, Trigger).serve("/trigger", divide)
     async with r2p.Module("PC1", via=network.transport()) as module, node_in(module) as node:
         client = node.client("divide", Divide)
         with pytest.raises(r2p.NoServer):
             await client.call(Divide.Request(), timeout=3)
         assert "service divide of ROS node /server is another math_srvs/Divide (RIHS01_0 there" in caplog.text
+        node.serve("grid", Grid, grid)
+        await asyncio.sleep(3)
+        assert "service grid is not on ROS: tests/Request.cells: ROS has no arrays of arrays" in caplog.text
+        assert module.links[0].losses["service not on ROS"] == 1
+        assert list(network.servers) == ["/divide"]
 
 
 @both
