@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import signal
 import struct
 from typing import TYPE_CHECKING, Any
 
@@ -95,3 +96,30 @@ async def test_peers_that_are_killed_are_replaced_by_new_ones(ros1: Ros1) -> Non
                 await user.until(lambda: user.log.count(("publisher gone", "/mortal/in", "/mortal")) == attempt)  # noqa: B023
         await user.until(lambda: "no connection: /mortal/in" in user.notices)
         assert "rosnode cleanup" in user.notices["no connection: /mortal/in"]
+
+
+async def test_a_subscriber_that_stands_still_makes_publishers_wait_for_a_second_and_then_loses_messages(
+    ros1: Ros1,
+) -> None:
+    async with running(ros1) as (middleware, user):
+        middleware.advertise(talk("/stuck/out", qos=Qos(depth=2)))
+        with ros1.peer("stuck") as peer:
+            await peer.do("subscribe", topic="/stuck/out", type="std_msgs/String")
+            await user.until(lambda: ("subscriber joined", "/stuck/out") in user.log)
+            peer.process.send_signal(signal.SIGSTOP)
+            long = frame(b"x" * 100_000)
+            while not middleware.full:  # the buffers of both sockets hold some megabytes
+                middleware.publish("/blink", "/stuck/out", long, 0)
+                await asyncio.sleep(0)
+            await user.until(lambda: ("made room",) in user.log)
+            assert "/stuck reads [/stuck/out] too slowly" in user.notices["slow subscriber: /stuck/out"]
+            for number in range(5):
+                middleware.publish("/blink", "/stuck/out", frame(b"%d" % number), 0)
+                assert not middleware.full
+            assert middleware.lost["ROS subscriber too slow"] == 5
+            peer.process.send_signal(signal.SIGCONT)
+            heard = ""
+            while heard != "4":  # of those that waited, the last two are left
+                (message,) = await peer.do("messages", topic="/stuck/out")
+                heard = message["message"]["data"]
+                assert heard[0] in "x34"
