@@ -44,7 +44,10 @@ class Ros1Context:
         self.running = False
         """True once there is a user, and connections are made and accepted."""
         self.paused = False
-        """True while messages of topics are not read."""
+        """True while messages of topics are not to be read. A connection stops reading when it gets the next ones: most
+        pauses are over before that.
+        """
+        self._held: set[asyncio.Transport] = set()
         self.keepalive = True
         """True if the kernel is to probe silent peers, as the parameter /tcp_keepalive says."""
         self.without_room: set[object] = set()
@@ -55,6 +58,20 @@ class Ros1Context:
         """Report to this user from now on."""
         self.user = user
         self.running = True
+
+    def hold(self, transport: asyncio.Transport) -> None:
+        """Stop reading from a connection until `resume`."""
+        if transport not in self._held and not transport.is_closing():
+            self._held.add(transport)
+            transport.pause_reading()
+
+    def resume(self) -> None:
+        """Go on reading from all connections."""
+        self.paused = False
+        held, self._held = self._held, set()
+        for transport in held:
+            if not transport.is_closing():
+                transport.resume_reading()
 
     def joined(self, topic: str) -> None:
         """Note a connection to a subscriber of one of the nodes that publish a topic."""

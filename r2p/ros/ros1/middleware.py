@@ -179,13 +179,9 @@ class Ros1Middleware(Middleware):
 
     def pause(self) -> None:
         self._context.paused = True
-        for subscription in self._subscriptions.values():
-            subscription.pause()
 
     def resume(self) -> None:
-        self._context.paused = False
-        for subscription in self._subscriptions.values():
-            subscription.resume()
+        self._context.resume()
 
     # Services
 

@@ -22,7 +22,7 @@ QUEUE_BYTES_MAX = 64 << 20
 """Bytes that wait for one subscriber at most, whatever the depth of its queue; one message more if it is empty."""
 
 _TURN_BYTES = 64 * 1024  # bytes that are gathered in one turn of the event loop before the socket is tried
-_GATHER = 20_000  # ns after a write in which a further message waits for others: a write takes about as long
+_GATHER = 20_000  # ns after a message was sent in which another one waits for more: less than a round trip takes
 TOO_SLOW = "ROS subscriber too slow"
 """The reason of messages that were dropped as a subscriber did not read them in time."""
 
@@ -124,8 +124,8 @@ class SubscriberConnection(TcprosConnection):
         if self.transport is not None:
             self.sent += messages
             self.bytes_sent += len(data)
+            self._sent_at = self._monotonic()  # before the write: in its course, the other side may answer already
             self.transport.write(data)
-            self._sent_at = self._monotonic()
 
     def _end_turn(self) -> None:
         self._many = len(self._turn or ()) > 1

@@ -5,7 +5,7 @@ A topic is received once, however many of this side's nodes subscribe to it: the
 
 import asyncio
 import socket
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 from r2p.clock import Backoff
 from r2p.ros.middleware import RosArrival, RosEndpoint, RosType
@@ -66,6 +66,8 @@ class PublisherConnection(TcprosConnection):
             self.context.user.received(arrivals)
         if self.reader.broken:
             self._break()
+        elif self.context.paused and self.transport is not None:
+            self.context.hold(self.transport)
 
     def on_header(self, fields: Fields) -> None:
         subscription = self._subscription
@@ -164,19 +166,9 @@ class Ros1Subscription:
         for uri in wanted - self._tasks.keys():
             self._tasks[uri] = asyncio.get_running_loop().create_task(self._follow(uri))
 
-    def pause(self) -> None:
-        """Stop reading."""
-        self._each_transport(lambda transport: transport.pause_reading())
-
-    def resume(self) -> None:
-        """Go on reading."""
-        self._each_transport(lambda transport: transport.resume_reading())
-
     def opened(self, connection: PublisherConnection, fields: Fields) -> None:
         """Note that messages come on a connection from now on."""
         self.connections[connection.uri] = connection
-        if self.context.paused and connection.transport is not None:
-            connection.transport.pause_reading()
         kind, text = fields.get("type", ""), fields.get("message_definition", "")
         latched = fields.get("latching") == "1"
         self.context.user.publisher_found(self.topic, connection.node, kind, text, latched=latched)
@@ -204,11 +196,6 @@ class Ros1Subscription:
         if connection is not None:
             connection.abort()
             self.closed(connection)
-
-    def _each_transport(self, act: Callable[[asyncio.Transport], object]) -> None:
-        for connection in self.connections.values():
-            if connection.transport is not None and not connection.transport.is_closing():
-                act(connection.transport)
 
     async def _follow(self, uri: str) -> None:
         """Connect to a publisher, again and again, until cancelled."""

@@ -14,6 +14,8 @@ from r2p.ros.ros1 import tcpros
 from r2p.ros.ros1.connections import HEADER_S, Ros1Context, TcprosListener
 from r2p.ros.ros1.publishers import SLOW_S, Ros1Publication
 from r2p.ros.ros1.services import REQUESTS_MAX, Ros1Server
+from r2p.ros.ros1.subscribers import PublisherConnection, Ros1Subscription
+from r2p.ros.ros1.xmlrpc import XmlRpcClient
 from tests.ros.ros1.recorder import Recorder, Wire
 
 pytestmark = pytest.mark.virtual_time
@@ -151,6 +153,23 @@ async def test_what_waits_is_sent_before_a_publication_closes() -> None:
     node.chat.close()
     assert (texts(wire.sent()), wire.closed) == ([b"one", b"two"], True)
     assert node.context.lost == Counter()
+
+
+async def test_a_connection_that_is_not_to_be_read_stops_at_its_next_message() -> None:
+    node = Node()
+    subscription = Ros1Subscription(node.context, XmlRpcClient(), "/in")
+    subscription.endpoints.append(RosEndpoint("/talker", "/in", STRING))
+    wire = Wire()
+    wire.connect(PublisherConnection(subscription, "http://other:1/"))
+    wire.receive(tcpros.encode_header(CHAT | {"callerid": "/other"}) + tcpros.frame(b"one"))
+    node.context.paused = True
+    assert wire.reads
+    wire.receive(tcpros.frame(b"two"))
+    assert not wire.reads
+    node.context.resume()
+    assert wire.reads
+    assert node.user.data("/in") == [b"one", b"two"]
+    wire.close()
 
 
 async def test_requests_of_one_connection_are_answered_in_turn_and_a_flood_is_not_read() -> None:
