@@ -1,9 +1,14 @@
 """Two processes over ROS 2's way with zenoh, against r2p's own way with it, without batching: both through a router."""
 
 import asyncio
+import os
+import random
+import subprocess
+import tempfile
 import time
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import NamedTuple
 
 import zenoh
@@ -14,10 +19,12 @@ from benchmarks.processes import process
 from benchmarks.table import Row, p50_p99, rate
 from benchmarks.zenoh import MESSAGE, Sixteen, port_of_session
 from r2p.ros.std_srvs import SetBool
+from tests.ros.rclpy import install
 
 MESSAGES = 100_000
 ROUNDS = 3_000
 CALLS = 1_000
+_RCLPY = Path(__file__).with_name("rclpy_ends.py")
 RUNS = 5
 SETTLED = 0.3  # seconds in which messages arrive that are on the way
 OURS, ROS = "zenoh:tcp/127.0.0.1:{}?scouting=off&network=bench&batching=off", "ros2:tcp/127.0.0.1:{}"
@@ -185,6 +192,34 @@ def rows() -> Iterator[Row]:
         "p50 within 1.3x",
         median <= 1.3 * our_median,
     )
+    theirs = _rclpy_calls()
     yield Row(
-        "calls over ROS 2 by zenoh, one after the other", f"{ros.calls:.0f}/s", f"zenoh: {ours.calls:.0f}/s", "", None
+        "calls over ROS 2 by zenoh, one after the other",
+        f"{ros.calls:.0f}/s",
+        f"zenoh: {ours.calls:.0f}/s; rclpy over Fast DDS {f'{theirs:.0f}/s' if theirs else 'is not here'}",
+        "2x rclpy",
+        ros.calls >= 2 * theirs if theirs else None,
     )
+
+
+def _rclpy_calls() -> float:
+    """Calls a second between two processes of rclpy, which need no router; 0 without it."""
+    python = install.find()
+    if isinstance(python, str):
+        return 0.0
+    domain = str(random.SystemRandom().randrange(1, 200))
+    with tempfile.TemporaryDirectory() as folder:
+        environ = {**os.environ, "ROS_DOMAIN_ID": domain, "ROS_LOCALHOST_ONLY": "1", "ROS_LOG_DIR": folder}
+        server = subprocess.Popen(
+            [python, _RCLPY, "serve"], env=environ, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
+        try:
+            assert server.stdout is not None
+            server.stdout.readline()
+            called = subprocess.run(
+                [python, _RCLPY, "call", str(CALLS)], env=environ, capture_output=True, check=True, timeout=60
+            )
+        finally:
+            server.terminate()
+            server.communicate()
+        return float(called.stdout)
