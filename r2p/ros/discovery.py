@@ -70,8 +70,8 @@ class RosDiscovery(DiscoveryProtocol):
         self.own: dict[TopicRole, LocalTopic] = {}
         self.own_nodes: dict[TopicRole, dict[str, int]] = {}
         """This module's nodes by what they publish and subscribe to, with their publisher classes (CLASS_...)."""
-        self.relayed_nodes: dict[TopicRole, dict[tuple[str, str], int]] = {}
-        """The same of modules behind this gateway; keys are module and node."""
+        self._relayed: dict[TopicRole, dict[tuple[int, str], int]] = {}
+        """The same of modules behind this gateway; keys are the module's instance and the node."""
         self._relayed_modules: dict[int, str] = {}
         self._names = names
         self._review = review
@@ -143,24 +143,40 @@ class RosDiscovery(DiscoveryProtocol):
     def relay(self, now: int, message: Relayed) -> list[Event]:
         """Note which nodes behind this gateway have which topics."""
         match message:
-            case management.Hello(name, instance, flags):
-                if flags & management.HELLO_LEAVING:
-                    self._relayed_modules.pop(instance, None)
-                else:
+            case management.Hello(_, instance, flags) if flags & management.HELLO_LEAVING:
+                self._relayed_modules.pop(instance, None)
+                for key in self._relayed_by(instance):
+                    nodes = self._relayed[key]
+                    self._set_relayed(key, {each: nodes[each] for each in nodes if each[0] != instance})
+            case management.Hello(name, instance):
+                if self._relayed_modules.get(instance) != name:
                     self._relayed_modules[instance] = name
+                    self._dirty |= dict.fromkeys(topic for topic, _ in self._relayed_by(instance))
             case management.Endpoint(role, instance, node, topic, publisher_class):
                 key = topic, role & ~ROLE_GONE
-                nodes = self.relayed_nodes.setdefault(key, {})
-                before = dict(nodes)
-                if role & ROLE_GONE:
-                    nodes.pop((self._relayed_modules.get(instance, ""), node), None)
-                else:
-                    nodes[self._relayed_modules.get(instance, ""), node] = publisher_class
-                if not nodes:
-                    del self.relayed_nodes[key]
-                if nodes != before:
-                    self._dirty[topic] = None
+                nodes = dict(self._relayed.get(key, {}))
+                nodes.pop((instance, node), None)
+                if not role & ROLE_GONE:
+                    nodes[instance, node] = publisher_class
+                self._set_relayed(key, nodes)
         return []
+
+    def nodes_behind(self, topic: str, role: int) -> Iterator[tuple[str, str]]:
+        """Yield the module and the node of each publisher or subscriber of a topic behind this gateway."""
+        for instance, node in self._relayed.get((topic, role), {}):
+            if node and (module := self._relayed_modules.get(instance)) is not None:
+                yield module, node
+
+    def _relayed_by(self, instance: int) -> list[TopicRole]:
+        return [key for key, nodes in self._relayed.items() if any(each[0] == instance for each in nodes)]
+
+    def _set_relayed(self, key: TopicRole, nodes: dict[tuple[int, str], int]) -> None:
+        if nodes != self._relayed.get(key, {}):
+            self._dirty[key[0]] = None
+        if nodes:
+            self._relayed[key] = nodes
+        else:
+            self._relayed.pop(key, None)
 
     def query(self, now: int) -> list[Event]:
         """Do nothing: the graph shows everything."""
@@ -174,7 +190,7 @@ class RosDiscovery(DiscoveryProtocol):
     def publishes_latched(self, topic: str) -> bool:
         """Return whether a publisher of this module, or behind this gateway, latches the topic."""
         key = topic, ROLE_PUBLISHES
-        classes = [*self.own_nodes.get(key, {}).values(), *self.relayed_nodes.get(key, {}).values()]
+        classes = [*self.own_nodes.get(key, {}).values(), *self._relayed.get(key, {}).values()]
         return any(each & CLASS_LATCHES for each in classes)
 
     def set_subscribed(self, topic: str, *, subscribed: bool) -> list[Event]:

@@ -273,9 +273,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         own = self._ros.own_nodes.get((topic, role), {})
         found = {("", node): self.names.own_node(node, self._space.module) for node in own if node}
         if self.options.ros_nodes:
-            for module, node in self._ros.relayed_nodes.get((topic, role), {}):
-                if module and node:
-                    found[module, node] = self.names.node(module, node)
+            for module, node in self._ros.nodes_behind(topic, role):
+                found[module, node] = self.names.node(module, node)
         return found
 
     def _log_node(self) -> str:

@@ -189,8 +189,7 @@ class RosServices:
         names, options = self._link.names, self._link.options
         found = {names.node(node) for node in self._discovery.own_nodes.get((topic, role), {}) if node}
         if options.ros_nodes:
-            relayed = self._discovery.relayed_nodes.get((topic, role), {})
-            found |= {names.node(module, node) for module, node in relayed if module and node}
+            found |= {names.node(*each) for each in self._discovery.nodes_behind(topic, role)}
         return sorted(found) or [self._registrations.module_node]
 
     def _connect(self, name: str, *, called: bool, served: bool) -> list[Event]:

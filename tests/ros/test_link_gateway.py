@@ -112,6 +112,12 @@ async def test_each_node_behind_the_gateway_as_a_ros_node(version: int) -> None:
         await publisher.publish(Speed(1.0))
         await asyncio.sleep(0.1)
         graph = network.graph(user)
+        async with bus.node("GONE") as other:
+            other.advertise("speed", Speed)
+            await asyncio.sleep(4)
+            assert "/r1/GONE/test" in network.nodes
+        await asyncio.sleep(10)
+        assert "/r1/GONE/test" not in network.nodes
     assert {"/r1/GW", "/r1/BASE/drive"} <= graph.nodes
     assert ("/r1/BASE/drive", "/r1/speed") in {(each.node, each.topic) for each in graph.publishers}
     assert ("/r1/BASE/drive", "/r1/goal") in {(each.node, each.topic) for each in graph.subscribers}
