@@ -16,12 +16,12 @@
 
 import enum
 import functools
-from typing import Annotated, Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Protocol, TypeVar, get_type_hints
 
 import msgspec
 
 from r2p.errors import Error, MessageError
-from r2p.messages import Len, Max, Message, Timestamp, i8, show
+from r2p.messages import Len, Max, Message, Nested, Timestamp, i8, layout, show
 from r2p.messages.definition import TYPE_NAME, MessageMeta
 from r2p.messages.layouts import full_name
 from r2p.services.definition import Service, name_nested
@@ -203,6 +203,35 @@ def action_types(action: type[ActionType[G, R, F]]) -> ActionTypes[G, R, F]:
     get_result = _service(f"{name}_GetResult", {"goal_id": UUID}, {"status": i8, "result": result})
     message = _message(f"{name}_FeedbackMessage", {"goal_id": UUID, "feedback": feedback})
     return ActionTypes(name.replace("/action/", "/"), goal, result, feedback, send_goal, get_result, message)
+
+
+def with_names(cls: type[Message], name: str = "") -> type[Message]:
+    """Return a class with ROS's names for the types in it, if it is a part of an action that was learnt by its fields.
+
+    These name no types. `name` is the full name of the class, if it was learnt as a part of another one.
+    """
+    name = name or layout(cls).name
+    for known in (GoalStatusArray, CancelGoal.Request, CancelGoal.Response):
+        if layout(known).name == name and layout(known).schema == layout(cls).schema:
+            return known
+    action, _, part = name.rpartition("_")
+    action = action.removesuffix("_SendGoal").removesuffix("_GetResult")
+    nested = {"goal": "Goal", "result": "Result", "feedback": "Feedback"}
+    if "/action/" not in name or part not in ("Request", "Response", "FeedbackMessage"):
+        return cls
+    hints: dict[str, Any] = {}
+    for field in layout(cls).fields:
+        inner = field.shape.layout.cls if isinstance(field.shape, Nested) else None
+        if field.name == "goal_id" and inner is not None and layout(inner).schema == layout(UUID).schema:
+            hints[field.name] = UUID
+        elif field.name in nested and inner is not None and "/action/" not in layout(inner).name:
+            hints[field.name] = _renamed(inner, f"{action}_{nested[field.name]}")
+    return _renamed(cls, name, hints) if hints else cls
+
+
+def _renamed(cls: type[Message], name: str, hints: dict[str, Any] = {}) -> Any:  # noqa: B006 - not changed
+    """Return a class with these fields under another name; `hints` are other types of some of them."""
+    return _message(name, get_type_hints(cls, include_extras=True) | hints)
 
 
 def _nested(action: Any, part: str) -> Any:

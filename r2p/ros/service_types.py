@@ -17,6 +17,7 @@ import msgspec
 from r2p.codecs.services import HEADER_SIZE, REQUESTS
 from r2p.errors import MessageError
 from r2p.messages import Layout, Message, Nested, layout, show
+from r2p.ros.action_types import with_names
 from r2p.ros.cdr import cdr
 from r2p.ros.definitions import service_md5
 from r2p.ros.hashes import TypeDescriptions
@@ -51,7 +52,11 @@ def service_shape(requests: Layout[Any], responses: Layout[Any]) -> ServiceShape
     They may be learnt from another module, with made-up names inside. Raises MessageError if they are not of a service.
     """
     name = requests.name.removesuffix(REQUESTS).removesuffix("Request").removesuffix("_")
-    return ServiceShape(name, _body(requests), _body(responses), requests, responses)
+    request, response = (
+        layout(with_names(_body(each).cls, f"{ros2_service_name(name)}_{part}"))
+        for each, part in ((requests, "Request"), (responses, "Response"))
+    )
+    return ServiceShape(name, request, response, requests, responses)
 
 
 def _body(topic: Layout[Any]) -> Layout[Any]:

@@ -14,6 +14,7 @@ from r2p.errors import MessageError
 from r2p.messages import Message, layout
 from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import TopicType
+from r2p.ros.action_types import with_names
 from r2p.ros.background import BackgroundResults
 from r2p.ros.classes import standard_classes
 from r2p.ros.middleware import RosPeerEndpoint
@@ -177,4 +178,4 @@ class TopicClasses:
 def _standard(cls: type[Message]) -> type[Message]:
     """Return the class of r2p.msg with this name and these fields, if there is one: its nested types have names."""
     known = standard_classes().get(layout(cls).name)
-    return known if known is not None and layout(known).schema == layout(cls).schema else cls
+    return known if known is not None and layout(known).schema == layout(cls).schema else with_names(cls)

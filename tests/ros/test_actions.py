@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Annotated, Any
+from typing import Annotated
 
 import pytest
 
@@ -269,17 +269,9 @@ async def test_a_client_that_is_a_ros_node() -> None:
 
 @pytest.mark.virtual_time
 async def test_through_a_gateway() -> None:
-    """A robot on a bus serves an action, which ROS 2 nodes call through a gateway."""
+    """A robot on a bus serves an action, which ROS 2 nodes call through a gateway that learns its types."""
     network, bus = FakeRosNetwork(2), Network()
-    types = action_types(Count)
-    of_topics: dict[str, Any] = {
-        "count/_action/send_goal": types.send_goal,
-        "count/_action/get_result": types.get_result,
-        "count/_action/cancel_goal": CancelGoal,
-        "count/_action/feedback": types.feedback_message,
-        "count/_action/status": GoalStatusArray,
-    }
-    gateway = r2p.Module("GW", via=[bus.transport(), network.transport(types=of_topics)], bridge=True)
+    gateway = r2p.Module("GW", via=[bus.transport(), network.transport()], bridge=True)
     async with (
         gateway,
         bus.node("ROBOT") as server_node,

@@ -7,7 +7,7 @@ import pytest
 import r2p
 from r2p.messages import message_type
 from r2p.ros import std_srvs
-from r2p.ros.action_types import Action, CancelGoal, GoalState, GoalStatusArray, action_types
+from r2p.ros.action_types import Action, CancelGoal, GoalState, GoalStatusArray, action_types, with_names
 from r2p.ros.classes import RosTypes
 from r2p.ros.definitions import parse_action, service_md5
 from r2p.ros.hashes import TypeDescriptions
@@ -111,6 +111,10 @@ def test_types_that_are_learnt_from_a_schema() -> None:
         assert shape.name == shape_of(service).name
         assert shape.request.schema == known.request.schema
         assert service_type(shape, 1).checksum == service_type(shape_of(service), 1).checksum
+        assert service_type(shape, 2).checksum == service_type(shape_of(service), 2).checksum
+    message = r2p.layout(action_types(Fibonacci).feedback_message)
+    named = with_names(message_type(message.name, message.schema))
+    assert (r2p.layout(named).schema, ros2_hash(named)) == (message.schema, ros2_hash(message.cls))
 
 
 def test_names() -> None:
