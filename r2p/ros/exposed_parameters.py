@@ -6,7 +6,7 @@ ROS has parameters in two ways, on a server of ROS 1 and as services of each nod
 import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from r2p.clock import in_background
 from r2p.codecs.own_services import WIRE_MIN
@@ -102,13 +102,12 @@ class ExposedParameters:
             self.modules.pop(module, None)
 
 
-async def _pause(seconds: float) -> Any:
+async def _pause(seconds: float) -> None:
     """Sleep. Under virtual time this keeps no program going."""
-    loop = asyncio.get_running_loop()
-    future = loop.create_future()
-    timer = loop.call_later(seconds, future.set_result, None)
+    ended = asyncio.Event()
+    timer = asyncio.get_running_loop().call_later(seconds, ended.set)
     in_background(timer)
     try:
-        await future
+        await ended.wait()
     finally:
         timer.cancel()

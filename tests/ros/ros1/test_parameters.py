@@ -11,7 +11,7 @@ import pytest
 
 import r2p
 from r2p.ros import exposed_parameters
-from r2p.ros.ros1 import from_url
+from r2p.ros.ros1 import from_url, registration
 from r2p.ros.ros1.master import MasterClient, MasterError
 from r2p.ros.ros1.xmlrpc import XmlRpcClient
 from r2p.testing.network import Network, node_in
@@ -39,6 +39,7 @@ class Mode(enum.Enum):
 def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("MODULES_PERIOD_S", "_OWN_PERIOD_S", "_REMOTE_PERIOD_S"):
         monkeypatch.setattr(exposed_parameters, name, 0.05)
+    monkeypatch.setattr(registration, "LOOK_S", 0.1)
 
 
 @pytest.fixture
@@ -51,6 +52,14 @@ async def master(ros1: Ros1) -> AsyncIterator[MasterClient]:
 def transport(ros1: Ros1, monkeypatch: pytest.MonkeyPatch, options: str = "") -> Any:
     monkeypatch.setenv("ROS_IP", "127.0.0.1")
     return from_url(parse(f"ros1:{ros1.uri}{options}"))
+
+
+@contextlib.asynccontextmanager
+async def ros_node(module: r2p.Module, name: str) -> AsyncIterator[r2p.Node]:
+    """A node that is a ROS node at once, as it has a topic."""
+    async with node_in(module, name=name) as node:
+        node.advertise("spin", r2p.msg.Led)
+        yield node
 
 
 async def until(condition: Callable[[], Any]) -> None:
@@ -73,7 +82,7 @@ async def test_rosparam_reads_and_sets(
     ros1: Ros1, master: MasterClient, rospy_peer: RospyPeer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     via = transport(ros1, monkeypatch, ",ns=/robot1")
-    async with r2p.Module("PC1", via=via, allow_control=True) as module, node_in(module, name="blink") as node:
+    async with r2p.Module("PC1", via=via, allow_control=True) as module, ros_node(module, "blink") as node:
         kp = node.parameter("kp", 0.5, max=2.0)
         mode = node.parameter("mode", Mode.OFF)
         gains = node.parameter("gains", (1, 2))
@@ -98,7 +107,7 @@ async def test_what_does_not_fit_is_put_back(
     ros1: Ros1, master: MasterClient, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     via = transport(ros1, monkeypatch)
-    async with r2p.Module("PC1", via=via, allow_control=True) as module, node_in(module, name="blink") as node:
+    async with r2p.Module("PC1", via=via, allow_control=True) as module, ros_node(module, "blink") as node:
         kp = node.parameter("kp", 0.5, max=2.0)
         await value(master, "/blink/kp", 0.5)
         for wrong in (3.0, "fast", {"p": 1}):
@@ -114,7 +123,7 @@ async def test_names_with_parts_are_namespaces(
     ros1: Ros1, master: MasterClient, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     via = transport(ros1, monkeypatch)
-    async with r2p.Module("PC1", via=via, allow_control=True) as module, node_in(module, name="blink") as node:
+    async with r2p.Module("PC1", via=via, allow_control=True) as module, ros_node(module, "blink") as node:
         kp = node.parameter("pid.kp", 0.5)
         node.parameter("pid", 1)
         await value(master, "/blink/pid", {"kp": 0.5})
@@ -127,7 +136,7 @@ async def test_a_node_that_starts_again(ros1: Ros1, master: MasterClient, monkey
     via = transport(ros1, monkeypatch)
     async with r2p.Module("PC1", via=via, allow_control=True) as module:
         for default in (0.5, 0.6):
-            async with node_in(module, name="again") as node:
+            async with ros_node(module, "again") as node:
                 node.parameter("kp", default)
                 await value(master, "/again/kp", default)
         await value(master, "/again", {})
@@ -137,7 +146,7 @@ async def test_without_permission(
     ros1: Ros1, master: MasterClient, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     via = transport(ros1, monkeypatch)
-    async with r2p.Module("PC1", via=via) as module, node_in(module, name="blink") as node:
+    async with r2p.Module("PC1", via=via) as module, ros_node(module, "blink") as node:
         kp = node.parameter("kp", 0.5)
         await value(master, "/blink/kp", 0.5)
         await master.set_param("/test", "/blink/kp", 0.7)
@@ -153,7 +162,7 @@ async def test_what_is_set_before_counts_and_stays(
     """As a launch file sets it."""
     await master.set_param("/test", "/early/kp", 1)
     via = transport(ros1, monkeypatch)
-    async with r2p.Module("PC1", via=via, allow_control=True) as module, node_in(module, name="early") as node:
+    async with r2p.Module("PC1", via=via, allow_control=True) as module, ros_node(module, "early") as node:
         kp, ki = node.parameter("kp", 0.5), node.parameter("ki", 0.1)
         await until(lambda: kp.value == 1.0)
         await value(master, "/early", {"kp": 1.0, "ki": 0.1})
@@ -184,7 +193,7 @@ async def test_a_master_that_returns_gets_all_again(own_ros1: Ros1, monkeypatch:
     client = XmlRpcClient()
     master = MasterClient(client, own_ros1.uri)
     via = transport(own_ros1, monkeypatch)
-    async with r2p.Module("PC1", via=via, allow_control=True) as module, node_in(module, name="blink") as node:
+    async with r2p.Module("PC1", via=via, allow_control=True) as module, ros_node(module, "blink") as node:
         kp = node.parameter("kp", 0.5)
         await value(master, "/blink/kp", 0.5)
         own_ros1.close()
