@@ -122,6 +122,7 @@ class TcprosConnection(asyncio.Protocol):
         self.peer = ""
         """The address of the other side."""
         self.transport: asyncio.Transport | None = None
+        self._given_up = False  # True if it was to be closed before it was there
         self._deadline: asyncio.TimerHandle | None = None
 
     def on_header(self, fields: Fields) -> None:
@@ -132,6 +133,9 @@ class TcprosConnection(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast("asyncio.Transport", transport)
+        if self._given_up:
+            self.transport.abort()
+            return
         self.transport.set_write_buffer_limits(high=0)  # what the socket does not take waits where it can be dropped
         address = self.transport.get_extra_info("peername") or ("?", 0)
         self.peer = f"{address[0]}:{address[1]}"
@@ -177,7 +181,8 @@ class TcprosConnection(asyncio.Protocol):
             self.transport.close()
 
     def abort(self) -> None:
-        """Close the connection at once."""
+        """Close the connection at once, or as soon as it is there."""
+        self._given_up = True
         self.end_wait()
         if self.transport is not None:
             self.transport.abort()
@@ -262,7 +267,7 @@ class TcprosListener:
         if self._starting is None:
             self._socket.close()
         else:
-            self._starting.add_done_callback(lambda task: task.result().close())
+            self._starting.add_done_callback(_close_server)
         for each in list(self.pending):
             each.abort()
 
@@ -290,6 +295,11 @@ class TcprosListener:
         """Return the topic or service of this node that a header asks for; empty if it has none of that name."""
         name = fields.get("service", fields.get("topic", ""))
         return name if name in self.services or name in self.topics else ""
+
+
+def _close_server(started: asyncio.Task[asyncio.Server]) -> None:
+    if not started.cancelled() and started.exception() is None:
+        started.result().close()
 
 
 def take_over(connection: TcprosConnection, successor: TcprosConnection, start: Callable[[], None]) -> None:

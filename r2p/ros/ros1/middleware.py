@@ -117,6 +117,9 @@ class Ros1Middleware(Middleware):
     def advertise(self, endpoint: RosEndpoint) -> None:
         node, topic = endpoint.node, endpoint.topic
         before = self._publications.get((node, topic))
+        if before is not None and before.endpoint.type == endpoint.type:
+            before.change(endpoint)
+            return
         if before is not None:
             self._end(before)
         publication = self._publications[node, topic] = Ros1Publication(endpoint, self._context)

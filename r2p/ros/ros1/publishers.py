@@ -109,6 +109,8 @@ class SubscriberConnection(TcprosConnection):
         if waiting:
             self.context.lost["ROS subscriber gone"] += waiting
         self._queue.clear()
+        if self._turn is not None:
+            self._turn = []
         self._publication.left(self)
 
     def close(self) -> None:
@@ -209,6 +211,13 @@ class Ros1Publication:
     def waits(self) -> bool:
         """Return whether publishers wait for subscribers without room."""
         return self.endpoint.qos.reliable
+
+    def change(self, endpoint: RosEndpoint) -> None:
+        """Go on with another quality of service; the type is the same."""
+        self.endpoint = endpoint
+        self._latched = endpoint.qos.transient_local
+        if not self._latched:
+            self.last = None
 
     def publish(self, data: bytes | memoryview) -> None:
         """Send a message to all subscribers."""

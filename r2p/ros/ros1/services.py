@@ -279,9 +279,12 @@ class Ros1Callers:
         return connection
 
     async def _open(self, service: str, address: Address, header: Fields) -> Ros1ServerConnection:
-        loop = asyncio.get_running_loop()
+        connection = Ros1ServerConnection(self._context)
         try:
-            _, connection = await loop.create_connection(lambda: Ros1ServerConnection(self._context), *address)
+            await asyncio.get_running_loop().create_connection(lambda: connection, *address)
+        except asyncio.CancelledError:
+            connection.abort()
+            raise
         except OSError as error:
             where = f"{address[0]}:{address[1]}"
             raise NoServer(

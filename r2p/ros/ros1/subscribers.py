@@ -49,9 +49,9 @@ class PublisherConnection(TcprosConnection):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         subscription = self._subscription
-        header = subscriber_header(subscription.node, subscription.topic, subscription.type)
-        assert self.transport is not None
-        self.transport.write(encode_header(header))
+        if self.transport is not None and not self.transport.is_closing() and subscription.endpoints:
+            header = subscriber_header(subscription.node, subscription.topic, subscription.type)
+            self.transport.write(encode_header(header))
 
     def data_received(self, data: bytes) -> None:
         if not self.open:

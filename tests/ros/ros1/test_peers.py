@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from r2p.errors import NoServer, ServiceError
 from r2p.ros.middleware import Qos, RosServer
+from r2p.ros.ros1 import publishers, subscribers
 from r2p.ros.ros1.tcpros import frame
 from tests.ros.ros1.recorder import ANY, INT, SET_BOOL, running, talk
 
 if TYPE_CHECKING:
+    from r2p.ros.ros1.middleware import Ros1Middleware
     from tests.ros.ros1.programs import Ros1
 
 pytestmark = [pytest.mark.xdist_group("ros1"), pytest.mark.processes, pytest.mark.anyio]
@@ -78,7 +81,8 @@ async def test_the_cpp_relay_and_a_bag_carry_any_type(ros1: Ros1, tmp_path: obje
         assert user.data("/played") == [struct.pack("<i", number) for number in range(5)]
 
 
-async def test_peers_that_are_killed_are_replaced_by_new_ones(ros1: Ros1) -> None:
+async def test_peers_that_are_killed_are_replaced_by_new_ones(ros1: Ros1, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subscribers, "REPORT_S", 0.2)
     async with running(ros1) as (middleware, user):
         middleware.advertise(talk("/mortal/out"))
         middleware.subscribe(talk("/mortal/in"))
@@ -98,9 +102,10 @@ async def test_peers_that_are_killed_are_replaced_by_new_ones(ros1: Ros1) -> Non
         assert "rosnode cleanup" in user.notices["no connection: /mortal/in"]
 
 
-async def test_a_subscriber_that_stands_still_makes_publishers_wait_for_a_second_and_then_loses_messages(
-    ros1: Ros1,
+async def test_a_subscriber_that_stands_still_makes_publishers_wait_for_a_moment_and_then_loses_messages(
+    ros1: Ros1, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(publishers, "SLOW_S", 0.2)
     async with running(ros1) as (middleware, user):
         middleware.advertise(talk("/stuck/out", qos=Qos(depth=2)))
         with ros1.peer("stuck") as peer:
@@ -123,3 +128,48 @@ async def test_a_subscriber_that_stands_still_makes_publishers_wait_for_a_second
                 (message,) = await peer.do("messages", topic="/stuck/out")
                 heard = message["message"]["data"]
                 assert heard[0] in "x34"
+
+
+async def test_a_server_that_is_killed_is_named_and_its_successor_is_called(ros1: Ros1) -> None:
+    async with running(ros1) as (middleware, _user):
+        for success in (True, False):
+            with ros1.peer("mortal_server") as peer:
+                fields = {"success": success, "message": "done"}
+                await peer.do("serve", service="/mortal/set", type="std_srvs/SetBool", fields=fields)
+                response = await middleware.call("/blink", "/mortal/set", SET_BOOL, b"\1", LIMIT)
+                assert response == bytes([success]) + frame(b"done")
+                peer.kill()
+                peer.process.wait()
+                with pytest.raises(NoServer, match=r"registered at 127\.0\.0\.1:.*its node has died"):
+                    await call_until_unanswered(middleware)
+
+
+async def call_until_unanswered(middleware: Ros1Middleware) -> None:
+    """Call until the connection that was kept is gone, too."""
+    for _ in range(2):
+        with contextlib.suppress(ServiceError):
+            await middleware.call("/blink", "/mortal/set", SET_BOOL, b"\1", LIMIT)
+
+
+async def test_messages_go_on_without_the_master_and_new_peers_come_with_its_successor(own_ros1: Ros1) -> None:
+    async with running(own_ros1) as (middleware, user):
+        middleware.advertise(talk("/out"))
+        middleware.subscribe(talk("/in"))
+        with own_ros1.peer("old") as old:
+            await old.do("subscribe", topic="/out", type="std_msgs/String")
+            await old.do("advertise", topic="/in", type="std_msgs/String")
+            await old.do("connected", topic="/out")
+            await old.do("connected", topic="/in")
+            own_ros1.close()
+            await user.until(lambda: any("topics that are connected go on" in each for each in user.notices.values()))
+            middleware.publish("/blink", "/out", frame(b"still here"), 0)
+            await old.do("messages", topic="/out")
+            await old.do("publish", topic="/in", fields={"data": "here, too"})
+            await user.until(lambda: user.data("/in") == [frame(b"here, too")])
+            own_ros1.restart()
+            with own_ros1.peer("new") as new:
+                await new.do("subscribe", topic="/out", type="std_msgs/String")
+                await user.until(lambda: user.log.count(("subscriber joined", "/out")) == 2)
+                middleware.publish("/blink", "/out", frame(b"again"), 0)
+                (heard,) = await new.do("messages", topic="/out")
+                assert heard["message"] == {"data": "again"}

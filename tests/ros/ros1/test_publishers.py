@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from r2p.ros.middleware import Qos, RosEndpoint, RosServer, RosService, RosType
 from r2p.ros.ros1 import tcpros
-from r2p.ros.ros1.connections import HEADER_S, Ros1Context, TcprosListener
+from r2p.ros.ros1.connections import HEADER_S, Ros1Context, TcprosConnection, TcprosListener
 from r2p.ros.ros1.publishers import SLOW_S, Ros1Publication
 from r2p.ros.ros1.services import REQUESTS_MAX, Ros1Server
 from r2p.ros.ros1.subscribers import PublisherConnection, Ros1Subscription
@@ -143,6 +143,25 @@ async def test_a_latched_topic_gives_its_last_message_to_each_new_subscriber() -
     node.chat.publish(b"last")
     header, *messages = texts(node.connect(tcpros.encode_header(CHAT)).sent())
     assert (tcpros.decode_header(header)["latching"], messages) == ("1", [b"last"])
+
+
+async def test_another_quality_of_service_keeps_the_connections() -> None:
+    node = Node(Qos(depth=1, reliable=False))
+    wire = node.join()
+    node.chat.change(RosEndpoint("/talker", "/chat", STRING, Qos(depth=3, transient_local=True)))
+    wire.takes = False
+    for number in range(4):
+        node.chat.publish(b"%d" % number)
+    assert (node.context.lost, node.chat.last) == (Counter(), tcpros.frame(b"3"))
+    wire.release()
+    assert texts(wire.sent()) == [b"0", b"1", b"2", b"3"]
+
+
+async def test_a_connection_that_was_given_up_is_closed_as_soon_as_it_is_there() -> None:
+    wire, connection = Wire(), TcprosConnection(Node().context)
+    connection.abort()
+    wire.connect(connection)
+    assert wire.closed
 
 
 async def test_what_waits_is_sent_before_a_publication_closes() -> None:
