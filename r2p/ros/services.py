@@ -279,17 +279,24 @@ class RosServices:
         if given is not None:
             definition = define(name, given)
             return definition.requests, definition.responses
+        if (known := self._shape_of_ros(name)) is not None:
+            definition = known.definition(name)
+            return definition.requests, definition.responses
         learnt = [self._link.class_of(name + end) for end in SERVICE_SUFFIXES]
         return None if learnt[0] is None or learnt[1] is None else (layout(learnt[0]), layout(learnt[1]))
 
+    def _shape_of_ros(self, name: str) -> ServiceShape | None:
+        """Return the types of a service that a ROS node serves, if it is one of every ROS."""
+        peers = self._discovery.peers.get((name + REQUESTS, ROLE_SUBSCRIBES), ())
+        known = _services_of_ros(self._link.middleware.version)
+        return next((known[each.type, each.checksum] for each in peers if (each.type, each.checksum) in known), None)
+
     def _show_type(self, name: str) -> None:
         """Enter the type of a service of a ROS node that no node here uses, for tools, if it is one of every ROS."""
-        peers = self._discovery.peers.get((name + REQUESTS, ROLE_SUBSCRIBES), ())
-        for peer in peers:
-            known = _services_of_ros(self._link.middleware.version).get((peer.type, peer.checksum))
-            if known is not None:
-                for topic, shape in known.definition(name).topics:
-                    self._discovery.set_type(topic, TopicType(shape.size, shape.fingerprint, shape.varies))
+        known = self._shape_of_ros(name)
+        if known is not None:
+            for topic, shape in known.definition(name).topics:
+                self._discovery.set_type(topic, TopicType(shape.size, shape.fingerprint, shape.varies))
 
     def message_type(self, fingerprint: bytes) -> type[Message] | None:
         """Return the class of the topics of a service of every ROS that has this fingerprint."""

@@ -196,9 +196,7 @@ class FakeRosNetwork:
             )
 
         servers = frozenset(
-            RosPeerServer(
-                server.node, server.service, *((server.type.name, server.type.checksum) if self.version == 2 else ())
-            )
+            RosPeerServer(server.node, server.service, server.type.name, server.type.checksum)
             for owner, server in self.servers.values()
             if owner is not participant
         )

@@ -350,3 +350,27 @@ async def test_the_text_of_an_error_arrives_whole_also_where_responses_are_short
         await asyncio.sleep(0.1)
         with pytest.raises(r2p.ServiceError, match=r"^2\.0 m/s is too fast"):
             await Peer(network.node("/caller"), Home).call("/home", Home.Request(2.0))
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(("serving", "calling"), [(1, 2), (2, 1)])
+async def test_a_gateway_between_ros_1_and_ros_2_passes_services_of_every_ros_on(serving: int, calling: int) -> None:
+    """Nobody gives it their types."""
+    one, other = FakeRosNetwork(serving), FakeRosNetwork(calling)
+
+    async def enable(request: SetBool.Request) -> SetBool.Response:
+        return SetBool.Response(success=request.data, message="on")
+
+    async with (
+        r2p.Module("GW", via=[one.transport(), other.transport()], bridge=True),
+        r2p.Module("PC1", via=one.transport()) as pc1,
+        r2p.Module("PC2", via=other.transport()) as pc2,
+        node_in(pc1, name="motors") as server,
+        node_in(pc2, name="pilot") as caller,
+    ):
+        server.serve("motors/enable", SetBool, enable)
+        await asyncio.sleep(5)
+        assert other.servers["/motors/enable"][1].node == "/GW"
+        client = caller.client("motors/enable", SetBool)
+        await client.ready(5)
+        assert await client.call(SetBool.Request(data=True), timeout=3) == SetBool.Response(True, "on")
