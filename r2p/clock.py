@@ -11,6 +11,7 @@ integer nanoseconds; durations in programs are numbers of seconds, and texts suc
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import functools
 import logging
 import math
@@ -137,6 +138,11 @@ def _running() -> asyncio.AbstractEventLoop | None:
 
 
 # Timers
+
+REAL_TIME: Final[contextvars.ContextVar[bool]] = contextvars.ContextVar("r2p.REAL_TIME", default=False)
+"""True in code whose timers are for other programs, such as time-outs of connections, also under virtual time at a
+speed: there they count real time.
+"""
 
 
 def in_background(timer: asyncio.TimerHandle, background: bool | Callable[[], bool] = True) -> None:

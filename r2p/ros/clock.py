@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator
 
 from r2p.clock import SteeredClock, Ticker
 from r2p.messages import Message, Timestamp
+from r2p.names import NODE_MAX
 from r2p.runtime.node import Node
 from r2p.runtime.topic import TopicSpace
 from r2p.units import MILLISECOND
@@ -38,17 +39,22 @@ async def ros_time(space: TopicSpace) -> AsyncIterator[None]:
     if known is not None and (known.publishers or known.queues):
         yield
     elif isinstance(clock, SteeredClock):
-        with contextlib.closing(Node(TOPIC, space)) as node:
+        with contextlib.closing(_node(space)) as node:
             following = asyncio.create_task(_follow(node, clock))
             try:
                 yield
             finally:
                 following.cancel()
     elif publishes_clock(space):
-        with contextlib.closing(Node(TOPIC, space)) as node, contextlib.closing(_ticker(node, space)):
+        with contextlib.closing(_node(space)) as node, contextlib.closing(_ticker(node, space)):
             yield
     else:
         yield
+
+
+def _node(space: TopicSpace) -> Node:
+    """Return the node that has the topic: its name has that of the module, as that of a ROS node exists once."""
+    return Node(f"{space.module}_{TOPIC}"[-NODE_MAX:], space)
 
 
 async def _follow(node: Node, clock: SteeredClock) -> None:

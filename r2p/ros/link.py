@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from r2p.clock import in_background
+from r2p.clock import REAL_TIME, in_background
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError, MessageError, TransportError
 from r2p.messages import SIZE_MAX, Message, layout
@@ -472,7 +472,9 @@ class RosLink(BufferedLink, MiddlewareUser):
             self._apply(self._ros.set_published(name, published=False))
 
     def received(self, messages: list[RosArrival]) -> None:
+        middleware_time = REAL_TIME.set(False)  # what subscribers begin is of this program
         self.receive(messages)
+        REAL_TIME.reset(middleware_time)
 
     @property
     def registrations(self) -> Registrations:
@@ -480,10 +482,11 @@ class RosLink(BufferedLink, MiddlewareUser):
         return self._registrations
 
     def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
-        own = self.own_servers.get(service)
-        if own is not None:
-            return own(request, answer, refuse)
-        return self.services.requested(service, request, answer, refuse)
+        handle = self.own_servers.get(service) or functools.partial(self.services.requested, service)
+        middleware_time = REAL_TIME.set(False)  # as above, for its handler
+        cancel = handle(request, answer, refuse)
+        REAL_TIME.reset(middleware_time)
+        return cancel
 
     def notice(self, kind: str, text: str, *, trouble: bool) -> None:
         self._hub.link_notice(self, kind, text, trouble=trouble)

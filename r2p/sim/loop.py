@@ -20,11 +20,11 @@ import itertools
 import random
 import selectors
 from collections.abc import Callable, Coroutine
-from heapq import heappush
+from heapq import heappop, heappush
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar, TypeVarTuple, Unpack
 
-from r2p.clock import SystemClock, check_timeout
+from r2p.clock import REAL_TIME, SystemClock, check_timeout
 from r2p.errors import Deadlock, MessageError
 from r2p.modules.unwinding import frames
 from r2p.sim.clocks import FollowingClock, PacedClock, VirtualClock
@@ -32,7 +32,7 @@ from r2p.units import SECOND
 
 if TYPE_CHECKING:
     import contextvars
-    from collections.abc import Sized
+    from collections import deque
     from concurrent.futures import Executor
 
 T = TypeVar("T")
@@ -48,6 +48,7 @@ _IDLE_CHECK: Final = 5 * SECOND  # between two checks whether a task has been wo
 _BUSY: Final = 100_000  # iterations of the loop at one instant, after which the next timer runs anyway
 _AHEAD: Final = 1000  # events in one iteration of the loop: signals and real file descriptors wait for so long
 _POLL_EVERY: Final = 64  # iterations between two polls of asyncio's own descriptor, which signals wake
+_SHORTEST_WAIT: Final = 0.001  # s: a real timer may ask for virtual time that stands still
 _LONGEST_WAIT: Final = 3600.0  # s: no poll takes much longer ones
 _SLOWEST, _FASTEST = 0.001, 10_000.0  # times real time
 _REAL: Final = SystemClock()  # only measures the real time until a Deadlock
@@ -102,7 +103,7 @@ Event: TypeAlias = tuple[int, int, Callable[..., object], tuple[Any, ...]]
 class VirtualLoop(asyncio.SelectorEventLoop):
     """An asyncio event loop under virtual time. `r2p.clock` uses its `clock` and `random`."""
 
-    _ready: Sized  # what asyncio will call next
+    _ready: deque[asyncio.Handle]  # what asyncio will call next
     _scheduled: list[asyncio.TimerHandle]  # asyncio's heap of timers; when it polls, the first one is not cancelled
     _clock_resolution: float  # asyncio runs timers that are due this much later, too
 
@@ -116,6 +117,8 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self.random = random.Random(seed)
         self.task_numbers = itertools.count(1)
         self._timer_numbers = itertools.count()
+        self._real_timers: list[_VirtualTimer] = []
+        """Timers in real time, of a paced clock."""
         self._jobs = 0
         self._limit = 0  # ns; up to here, not including, `run_ahead` may go
         self._turns = 0
@@ -140,6 +143,8 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """
         if self.is_closed():
             raise RuntimeError("Event loop is closed")
+        if self.clock.paced and REAL_TIME.get():
+            return self._call_at_real(max(when - self.time(), _SHORTEST_WAIT), callback, args, context)
         if when < _HORIZON:
             instant = _nanoseconds(when)
             when = instant / SECOND
@@ -148,6 +153,29 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         timer = _VirtualTimer(when, next(self._timer_numbers), callback, args, self, context)
         heappush(self._scheduled, timer)
         return timer
+
+    def _call_at_real(
+        self, delay: float, callback: Any, args: Any, context: contextvars.Context | None
+    ) -> asyncio.TimerHandle:
+        when = _REAL.monotonic() / SECOND + delay
+        timer = _VirtualTimer(when, next(self._timer_numbers), callback, args, self, context)
+        timer._scheduled = False  # noqa: SLF001 - in the heap of virtual timers, as far as asyncio cares
+        heappush(self._real_timers, timer)
+        return timer
+
+    def _run_real_timers(self) -> None:
+        """Call the real timers that are due."""
+        now = _REAL.monotonic() / SECOND
+        while self._real_timers and (self._real_timers[0].when() <= now or self._real_timers[0].cancelled()):
+            timer = heappop(self._real_timers)
+            if not timer.cancelled():
+                self._ready.append(timer)
+
+    def _until_real_timer(self) -> float:
+        """Return the real seconds until the next real timer."""
+        if not self._real_timers:
+            return _LONGEST_WAIT
+        return max(0.0, self._real_timers[0].when() - _REAL.monotonic() / SECOND)
 
     def run_in_executor(
         self, executor: Executor | None, func: Callable[[Unpack[Ts]], T], *args: *Ts
@@ -208,6 +236,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _advance(self) -> None:
         """Let the time of a paced clock pass, up to the next timer."""
         self.clock.advance(min(self._next_timer(), _nanoseconds(self._end)))
+        self._run_real_timers()
 
     def _idle(self) -> float | None:
         """Jump to the next timer: nothing is left to do at this instant. Return for how long to wait, None: for events.
@@ -235,7 +264,9 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         instant, end = self._next_timer(), _nanoseconds(self._end)
         if self.clock.elapsed >= end:
             self._give_up(True)
-        return 0.0 if instant <= self.clock.elapsed else min(self.clock.delay(min(instant, end)), _LONGEST_WAIT)
+        if instant <= self.clock.elapsed or self._ready:
+            return 0.0
+        return min(self.clock.delay(min(instant, end)), self._until_real_timer(), _LONGEST_WAIT)
 
     def _give_up(self, later: bool) -> NoReturn:
         if not later:

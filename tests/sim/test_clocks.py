@@ -1,12 +1,13 @@
 """Virtual time at a speed, and after another clock: what it waits for, and that real connections work."""
 
 import asyncio
+import contextlib
 import socket
 
 import pytest
 
 import r2p.sim
-from r2p.clock import SteeredClock, clock_of
+from r2p.clock import REAL_TIME, SteeredClock, clock_of
 from r2p.sim.clocks import FollowingClock, PacedClock
 from r2p.units import SECOND
 
@@ -77,6 +78,34 @@ def test_timers_and_jobs_in_threads() -> None:
         return due
 
     assert r2p.sim.run(main, speed=2000) == [10.0, 20.0, 30.0]
+
+
+def test_timers_for_other_programs_are_real() -> None:
+    """A time-out of a connection must not be ten times as short, nor wait for a simulator that pauses."""
+
+    async def main() -> list[str]:
+        clock, order = clock_of(), []
+        assert isinstance(clock, SteeredClock)
+        clock.follow(SIMULATED, lambda: True)
+
+        async def connection() -> None:
+            REAL_TIME.set(True)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(0.02):
+                    await asyncio.get_running_loop().create_future()
+            order.append("time-out")
+            asyncio.get_running_loop().call_later(1000.0, order.append, "never").cancel()
+            await asyncio.sleep(0.01)
+            clock.follow(SIMULATED + SECOND, lambda: True)
+
+        async def node() -> None:
+            await asyncio.sleep(1.0)
+            order.append("node")
+
+        await asyncio.gather(connection(), node())
+        return order
+
+    assert r2p.sim.run(main, follow=True) == ["time-out", "node"]
 
 
 def test_the_limit_ends_a_program_that_waits_for_others() -> None:

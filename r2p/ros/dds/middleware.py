@@ -6,6 +6,7 @@ theirs. A writer without room for a message keeps it here, and tries again; the 
 
 import asyncio
 import contextlib
+import contextvars
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import ClassVar
@@ -80,11 +81,11 @@ class DdsMiddleware(Middleware):
         self._user: MiddlewareUser
 
     async def run(self, user: MiddlewareUser, opened: Callable[[], object]) -> None:
-        self._user, loop = user, asyncio.get_running_loop()
+        self._user, loop, context = user, asyncio.get_running_loop(), contextvars.copy_context()
 
         def hand_over(events: DdsEvents) -> None:
             with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(self._handle, events)
+                loop.call_soon_threadsafe(self._handle, events, context=context)
 
         participant = await asyncio.to_thread(Participant, *self._place, hand_over)
         self._participant = participant

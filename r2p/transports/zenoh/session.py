@@ -8,6 +8,7 @@ network.
 import asyncio
 import concurrent.futures
 import contextlib
+import contextvars
 import functools
 import json
 import threading
@@ -67,6 +68,7 @@ class LoopQueue:
         self._most = most
         self._items: deque[Any] = deque()
         self._scheduled = False
+        self._context = contextvars.copy_context()  # that of the link: zenoh's threads have none
         self.overflowed = 0
         """Items that did not fit, as there were `most` already."""
 
@@ -79,7 +81,7 @@ class LoopQueue:
         if not self._scheduled:
             self._scheduled = True
             with contextlib.suppress(RuntimeError):  # the loop is closed
-                self._loop.call_soon_threadsafe(self._drain)
+                self._loop.call_soon_threadsafe(self._drain, context=self._context)
 
     def count_error(self, error: Exception) -> None:
         """Count an error that kept an item out; in any thread."""
