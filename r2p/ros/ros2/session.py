@@ -48,7 +48,15 @@ class RmwSession:
 
     def queue(self, handle: Callable[[Any], None]) -> LoopQueue:
         """Make a queue from zenoh's threads into the loop."""
-        return LoopQueue(self.loop, handle, self.lost, most=_QUEUE_MAX)
+
+        def counted(item: Any) -> None:
+            if queue.overflowed:
+                self.lost["events overflown"] += queue.overflowed
+                queue.overflowed = 0
+            handle(item)
+
+        queue = LoopQueue(self.loop, counted, self.lost, most=_QUEUE_MAX)
+        return queue
 
     def add_node(self, node: str) -> None:
         """Declare a node."""

@@ -256,7 +256,7 @@ class RmwSubscription:
         """Return a message; None for one that was received before. Raises DecodeError, with the reason to count."""
         header, payload = sample.attachment, sample.payload
         if not 0 < len(payload) <= SIZE_MAX:
-            raise DecodeError("too long" if payload else "empty")
+            raise DecodeError("too long" if payload else "undecodable")
         if header is None or len(header) > _ATTACHMENT_MAX:
             raise DecodeError("wrong attachment")
         data = header.to_bytes()

@@ -44,7 +44,7 @@ async def test_recorded_messages() -> None:
             await user.until(lambda: user.arrivals and user.arrivals[-1].data == b"end")
         assert [(each.data, each.sequence) for each in user.arrivals[:-1]] == expected
         assert {each.node for each in user.arrivals} == {""}
-        assert a.lost == {"wrong attachment": 3, "empty": 2}
+        assert a.lost == {"wrong attachment": 3, "undecodable": 2}
         assert unusable == 5
 
 
