@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from r2p.clock import REAL_TIME, in_background
-from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.codecs.management import ANY_TYPE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError, MessageError, TransportError
 from r2p.messages import SIZE_MAX, Message, layout
 from r2p.names import LOG, SERVICE_SUFFIXES
@@ -195,9 +195,14 @@ class RosLink(BufferedLink, MiddlewareUser):
         return found, ""
 
     def _misfit(self, topic: str, cls: type[Message]) -> str:
-        """Return how a class differs from the messages on a gateway's other links; empty if it does not."""
+        """Return how a class differs from the messages on a gateway's other links; empty if it does not.
+
+        Publishers there count, or firmware that subscribes: r2p's subscribers see for themselves that a type differs.
+        """
         published, asked = self._elsewhere(topic)
-        theirs, ours = published if published != TopicType() else asked, _class_type(cls)
+        theirs, ours = published, _class_type(cls)
+        if published == TopicType() and asked.fingerprint == ANY_TYPE:
+            theirs = asked
         if ours.fits(theirs):
             return ""
         sizes = f" has {ours.size} bytes, messages of others {theirs.size}" if ours.size != theirs.size else " differs"

@@ -21,6 +21,8 @@ from r2p.ros.middleware import RosPeerEndpoint
 from r2p.ros.topics import TopicTypes, ros_class, ros_type
 from r2p.transports.link import Hub
 
+_TRIES = 12
+
 _TRY_AGAIN_S = 5.0
 """Seconds after which modules are asked once more for a type that none of them gave."""
 
@@ -122,12 +124,16 @@ class TopicClasses:
         return found
 
     async def _learn(self, topic: str, fingerprint: bytes) -> None:
-        found = await self._ask_modules(fingerprint, topic)
-        while found is None:
-            await self._pause()
+        for _ in range(_TRIES):
             found = await self._ask_modules(fingerprint, topic)
-        self._learnt[topic, fingerprint] = _standard(found)
-        self._changed(topic)
+            if found is not None:
+                if len(self._learnt) >= TABLE_MAX:
+                    self._learnt.clear()
+                self._learnt[topic, fingerprint] = _standard(found)
+                self._changed(topic)
+                return
+            await self._pause()
+        del self._tasks[topic, fingerprint]  # the next change of the topic begins anew
 
     # Of ROS nodes
 
@@ -138,7 +144,7 @@ class TopicClasses:
             found = self._background.get(topic, key, lambda: self._make(peer.type, peer.checksum, given))
         except MessageError:
             if not given:
-                self._start((peer.type, peer.checksum), self._describe, topic, peer)
+                self._start((peer.node, peer.type, peer.checksum), self._describe, topic, peer)
             return None
         return found
 

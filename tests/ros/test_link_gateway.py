@@ -207,6 +207,24 @@ async def test_a_subscriber_that_comes_later_gets_its_type(version: int) -> None
 
 @both
 @pytest.mark.virtual_time
+async def test_a_subscriber_of_a_wrong_type_does_not_take_the_topic_from_the_others(version: int) -> None:
+    network, bus = FakeRosNetwork(version), Network()
+    user = network.node("/user")
+    twist = ros_class("geometry_msgs/Twist", version)
+    user.advertise("/cmd_vel", twist)
+    async with gateway("GW", bus, network, types={"cmd_vel": Velocity3}) as module, bus.node("BASE") as base:
+        subscriber = base.subscribe("cmd_vel", Velocity3)
+        await asyncio.sleep(4)
+        async with bus.node("ATOOL") as wrong:
+            wrong.subscribe("cmd_vel", twist)
+            await asyncio.sleep(4)
+            user.publish("/cmd_vel", twist())
+            assert await subscriber.fetch() == Velocity3(0.0, 0.0, 0.0)
+            assert not module.links[1].not_carried()
+
+
+@both
+@pytest.mark.virtual_time
 async def test_latched_values_pass_the_gateway(version: int) -> None:
     network, bus = FakeRosNetwork(version), Network()
     user = network.node("/user")
