@@ -1,7 +1,7 @@
 """Turtles that draw as those of ROS's turtlesim do. There is no window: the drawing is printed at the end.
 
 r2p run turtles.py:turtlesim --via ros1:        for programs of ROS, and for turtle_client.py
-rosservice call /spawn 2 2 0 leo                a second turtle
+r2p service call spawn x=2 y=2 name=leo --type turtlesim.py:Spawn --via ros1:        a second turtle
 rostopic pub -r 10 /leo/cmd_vel geometry_msgs/Twist '{linear: {x: 2}, angular: {z: 1}}'
 """
 
