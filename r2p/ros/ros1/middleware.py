@@ -299,7 +299,8 @@ class Ros1Middleware(Middleware):
 
 
 def _outgoing(connection: SubscriberConnection) -> BusConnection:
-    topic, text = connection.topic, f"TCPROS connection to {connection.peer}"
+    lost = f", {connection.dropped} messages dropped" if connection.dropped else ""
+    topic, text = connection.topic, f"TCPROS connection to {connection.peer}{lost}"
     sent = connection.bytes_sent, connection.sent
     return BusConnection(connection.number, topic, connection.node, "o", True, *sent, text)
 

@@ -89,6 +89,7 @@ async def test_a_subscriber_that_does_not_read_gets_the_newest_messages_and_stop
         await asyncio.sleep(0)
     assert len(texts(other.sent())) == 10
     assert node.context.lost == Counter({"ROS subscriber too slow": 6})  # 0 is in the socket, 7 to 9 wait
+    assert [each.dropped for each in node.chat.connections] == [6, 0]
     stuck.release()
     assert texts(stuck.sent()) == [b"0", b"7", b"8", b"9"]
     assert not node.context.without_room  # best effort never makes publishers wait
