@@ -452,6 +452,7 @@ class FakeMiddleware(Middleware, Participant):
     # Services
 
     def serve(self, server: RosServer) -> None:
+        assert server.service not in self.network.servers, f"two servers of {server.service}"
         self.network.servers[server.service] = self, server
         self.network.changed()
 

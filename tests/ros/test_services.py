@@ -374,3 +374,29 @@ async def test_a_gateway_between_ros_1_and_ros_2_passes_services_of_every_ros_on
         client = caller.client("motors/enable", SetBool)
         await client.ready(5)
         assert await client.call(SetBool.Request(data=True), timeout=3) == SetBool.Response(True, "on")
+
+
+@both
+@pytest.mark.virtual_time
+async def test_two_gateways_handle_a_call_once(version: int) -> None:
+    network, bus = FakeRosNetwork(version), Network()
+    peer = Peer(network.node("/peer"), Divide)
+    handled: list[str] = []
+
+    async def ours(request: Divide.Request) -> Divide.Response:
+        handled.append("ours")
+        return await divide(request)
+
+    async def theirs(request: Divide.Request) -> Divide.Response:
+        handled.append("theirs")
+        return await divide(request)
+
+    peer.serve("/theirs", theirs)
+    gateways = [r2p.Module(name, via=[bus.transport(), network.transport()], bridge=True) for name in ("GW1", "GW2")]
+    async with gateways[0], gateways[1], bus.node("MOTOR") as node:
+        node.serve("ours", Divide, ours)
+        client = node.client("theirs", Divide)
+        await asyncio.sleep(20)
+        assert (await peer.call("/ours", Divide.Request(4.0, 2.0))).quotient == 2
+        assert (await client.call(Divide.Request(4.0, 2.0))).quotient == 2
+        assert handled == ["ours", "theirs"]
