@@ -223,7 +223,7 @@ class ActionClient(HandlerOwner, Generic[G, R, F]):
                 raise NoServer(f"action {self.name} has no server: {error}") from None
             raise
         if not response.accepted:
-            del self.goals[goal_id]
+            self.goals.pop(goal_id, None)
             raise GoalRejected(f"action {self.name}: the server has rejected the goal; its log says why")
         made.accepted_at, made.state = response.stamp.ns, max(made.state, GoalState.ACCEPTED)
         self._begin(self._follow(made))
