@@ -50,7 +50,7 @@ async def test_tools_see_a_node_with_what_it_has(ros1: Ros1) -> None:
     """Of a topic without publishers `rosnode` never knows the type."""
     async with running(ros1.uri, "/robot/arm") as (session, recorder):
         session.advertise("/robot/arm", "/pose", STRING)
-        session.subscribe("/robot/arm", "/velocity", "geometry_msgs/Twist")
+        session.subscribe("/robot/arm", "/robot/arm/velocity", "geometry_msgs/Twist")
         session.serve("/robot/arm", "/reset", 7)
         recorder.bus = [BusConnection(3, "/pose", "/viewer", "o", True, 120, 2, "TCPROS connection to viewer")]
         await recorder.event("up")
@@ -58,10 +58,10 @@ async def test_tools_see_a_node_with_what_it_has(ros1: Ros1) -> None:
             ros1.run("rosnode", "ping", "-c", "1", "/robot/arm"),
             ros1.run("rosnode", "info", "/robot/arm"),
             ros1.run("rosnode", "list"),
-            ros1.run("rostopic", "info", "/velocity"),
+            ros1.run("rostopic", "info", "/robot/arm/velocity"),
         )
     assert "xmlrpc reply from http://127.0.0.1:" in pinged.output
-    for line in ("* /pose [std_msgs/String]", "* /velocity [unknown type]", "* /reset", "* to: /viewer"):
+    for line in ("* /pose [std_msgs/String]", "* /robot/arm/velocity [unknown type]", "* /reset", "* to: /viewer"):
         assert line in info.output
     assert "/robot/arm" in nodes.output.split()
     assert "Subscribers: \n * /robot/arm (http://127.0.0.1:" in topics.output
