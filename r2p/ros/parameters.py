@@ -292,6 +292,12 @@ def _nothing_to_cancel() -> None: ...
 def _ignore(node: str) -> None: ...
 
 
+def _report(link: RosLink, task: "asyncio.Task[None]") -> None:
+    error = None if task.cancelled() else task.exception()
+    if isinstance(error, Exception):
+        link.stats.lost.internal_error(error)
+
+
 class ParameterTransport(RosTransport):
     """Makes links whose ROS nodes have parameters."""
 
@@ -300,6 +306,7 @@ class ParameterTransport(RosTransport):
             await super().run_link(hub, link, opened)
             return
         offering = asyncio.get_running_loop().create_task(RosParameters(hub, link).run())
+        offering.add_done_callback(functools.partial(_report, link))
         try:
             await super().run_link(hub, link, opened)
         finally:

@@ -10,6 +10,7 @@ Nothing of Cyclone DDS calls into Python: a callback would need the interpreter'
 
 import contextlib
 import ctypes
+import os
 import threading
 from collections.abc import Callable
 from typing import Any, Final
@@ -392,6 +393,7 @@ class _OpenDomain(msgspec.Struct):
 _domains: dict[int, _OpenDomain] = {}
 _domains_lock = threading.Lock()
 
+_OWN_CONFIG = "CYCLONEDDS_URI"
 _CONFIG = "<CycloneDDS><Domain><General><Interfaces><NetworkInterface {}/></Interfaces></General></Domain></CycloneDDS>"
 
 
@@ -410,9 +412,11 @@ def _open_domain(number: int, interface: str) -> Domain:
 
 
 def _make_domain(number: int, interface: str) -> Domain:
+    """Return a domain with Cyclone's own configuration, if the user has one, unless an interface is given."""
     chosen = f'name="{interface}" multicast="true"' if interface else 'autodetermine="true"'
+    own = "" if interface else os.environ.get(_OWN_CONFIG, "")
     try:
-        return Domain(number, _CONFIG.format(chosen))
+        return Domain(number, own or _CONFIG.format(chosen))
     except DDSException as error:
         raise TransportError(f"dds: Cyclone DDS can't use {interface or 'the network'}: {error}") from error
 

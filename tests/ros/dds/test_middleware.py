@@ -175,6 +175,12 @@ async def test_the_environment_of_ros_counts(monkeypatch: pytest.MonkeyPatch, do
         with pytest.raises(TransportError, match=f"one interface for domain {domain}"):
             async with r2p.Module("PC2", via=f"dds:?domain={domain},interface=eth0"):
                 pass
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "0")
+    config = "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='nope9'/></Interfaces></General></Domain>"
+    monkeypatch.setenv("CYCLONEDDS_URI", f"{config}</CycloneDDS>")
+    with pytest.raises(TransportError, match="Cyclone DDS can't"):
+        async with r2p.Module("PC3", via="dds:"):
+            pass
     monkeypatch.setenv("ROS_DOMAIN_ID", "x")
     with pytest.raises(TransportError, match="ROS_DOMAIN_ID=x: a domain is a number"):
         open_transport("dds:")
