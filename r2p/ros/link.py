@@ -531,6 +531,7 @@ class RosTransport(Transport):
             if publishes_clock(hub.space):
                 middleware.set_sim_time()
             async with ros_time(hub.space):
+                REAL_TIME.set(True)  # in this task, and in what it starts
                 await self.run_link(hub, link, opened)
         finally:
             link.close()

@@ -2,16 +2,20 @@
 
 import asyncio
 import itertools
+from collections.abc import Callable
 
 import pytest
 
 import r2p
 import r2p.sim
+from r2p.clock import REAL_TIME
 from r2p.messages import Timestamp
 from r2p.ros.clock import RosClock
+from r2p.ros.link import RosTransport
+from r2p.ros.middleware import MiddlewareUser
 from r2p.testing.network import node_in
 from r2p.units import MILLISECOND, SECOND
-from tests.ros.fake import FakeRosNetwork
+from tests.ros.fake import FakeMiddleware, FakeRosNetwork
 
 both = pytest.mark.parametrize("version", [1, 2])
 SIMULATED = 100 * SECOND
@@ -61,3 +65,19 @@ def test_a_program_follows_the_time_of_ros(version: int) -> None:
             assert node.now() > SIMULATED + 3 * SECOND
 
     r2p.sim.run(main, follow=True)
+
+
+@pytest.mark.virtual_time
+async def test_connections_have_real_time_and_what_they_deliver_has_not() -> None:
+    """Else a simulator that has died could not be found out: the time that it gave stands still."""
+    network, seen = FakeRosNetwork(1), list[bool]()
+
+    class Watched(FakeMiddleware):
+        async def run(self, user: MiddlewareUser, opened: Callable[[], object]) -> None:
+            seen.append(REAL_TIME.get())
+            await super().run(user, opened)
+
+    transport = RosTransport("ros1:", lambda _hub: Watched(network))
+    async with r2p.Module("PC1", via=transport):
+        seen.append(REAL_TIME.get())
+    assert seen == [True, False]
