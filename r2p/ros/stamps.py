@@ -49,11 +49,12 @@ class StampSource:
 
     def __init__(self, cls: type[Message], counts: Counter[str]) -> None:
         self._counts = counts
-        self._read = _reader(layout(cls))
+        self.read = _reader(layout(cls))
+        """Returns the own stamp of a packed message in ns, by whichever clock; None for a type without one."""
 
     def own(self, data: bytes) -> int:
         """Return the own stamp of a packed message in ns, by whichever clock; 0 without one."""
-        return self._read(data) if self._read is not None else 0
+        return self.read(data) if self.read is not None else 0
 
     def find(self, sample: Sample[Any]) -> int:
         """Return the stamp of a sample, UTC in ns."""

@@ -234,7 +234,7 @@ def _unpacked(shape: Layout[Any]) -> Callable[[bytes], Decoded]:
         own = stamps.own(data)
         return data, None, own if own >= StampSource.OLDEST_UTC else 0
 
-    return decode
+    return decode if size or stamps.read is not None else lambda data: (data, None, 0)
 
 
 def _to_cdr(theirs: type[Message], stamps: _HeaderStamps | None) -> Callable[[Sample], Sequence[bytes]]:
