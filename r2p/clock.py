@@ -191,7 +191,9 @@ class Alarm:
     def _arm(self, deadline: int, delay: int) -> None:
         self._armed = deadline
         if self._clock.virtual:  # the instant itself: a sum of floats may miss it by a nanosecond
+            outer = REAL_TIME.set(False)  # whichever code moves it, and for what it calls
             self._timer = self._loop.call_at(deadline / SECOND, self._fire)
+            REAL_TIME.reset(outer)
             in_background(self._timer, self._background)
         else:
             self._timer = self._loop.call_later(delay / SECOND, self._fire)
