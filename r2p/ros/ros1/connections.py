@@ -10,7 +10,7 @@ import itertools
 import socket
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Protocol, cast
 
 from r2p.clock import random_of
@@ -24,7 +24,9 @@ HEADER_S = 5.0
 """Seconds for the header of the other side."""
 
 CONNECTIONS_MAX = 1000
-"""Connections that one node accepts at a time."""
+"""Connections that one node has at a time; and as many that have not sent their header: of those, another one takes the
+place of the one that has waited for longest.
+"""
 
 _IDLE_S = 10  # seconds without traffic until the kernel probes the other side: rospy waits 60
 _INTERVAL_S = 2  # seconds between two of these probes
@@ -198,6 +200,10 @@ class TcprosConnection(asyncio.Protocol):
 class Acceptor(Protocol):
     """What a node offers to those that connect: a publication, or a server."""
 
+    @property
+    def connections(self) -> Collection[TcprosConnection]:
+        """Return the connections that it has."""
+
     def accept(self, fields: Fields, connection: TcprosConnection) -> str:
         """Hand a connection with this header to its new protocol; return why it is refused, or an empty text."""
 
@@ -215,11 +221,11 @@ class _IncomingConnection(TcprosConnection):
             self.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._listener.pending.discard(self)
+        self._listener.pending.pop(self, None)
         super().connection_lost(exc)
 
     def on_header(self, fields: Fields) -> None:
-        self._listener.pending.discard(self)
+        self._listener.pending.pop(self, None)
         refusal = self._listener.accept(fields, self)
         if refusal and self.transport is not None:
             self.context.refuse(self._listener.known_name(fields), refusal)
@@ -241,8 +247,8 @@ class TcprosListener:
         self.context = context
         self.topics: dict[str, Acceptor] = {}
         self.services: dict[str, Acceptor] = {}
-        self.pending: set[TcprosConnection] = set()
-        """Connections without a header yet."""
+        self.pending: dict[TcprosConnection, None] = {}
+        """Connections without a header yet, the oldest first."""
         try:
             family = socket.AF_INET6 if ":" in bind else socket.AF_INET
             self._socket = socket.create_server((bind, 0), family=family)
@@ -272,11 +278,16 @@ class TcprosListener:
             each.abort()
 
     def admit(self, connection: TcprosConnection) -> bool:
-        """Return whether there is a place for one more connection that has not sent its header."""
-        if self.closed or len(self.pending) >= CONNECTIONS_MAX:
+        """Wait for the header of one more connection; return False if the listener is closed."""
+        if self.closed:
             self.context.lost[_ADMITTED] += 1
             return False
-        self.pending.add(connection)
+        self.pending[connection] = None
+        if len(self.pending) > CONNECTIONS_MAX:
+            self.context.lost[_ADMITTED] += 1
+            oldest = next(iter(self.pending))
+            del self.pending[oldest]
+            oldest.abort()
         return True
 
     def accept(self, fields: Fields, connection: TcprosConnection) -> str:
@@ -289,6 +300,9 @@ class TcprosListener:
         found = offered.get(name)
         if found is None:
             return f"[{self.node}] {verb} no [{name}]"
+        if sum(len(each.connections) for table in (self.topics, self.services) for each in table.values()) >= CONNECTIONS_MAX:
+            self.context.lost[_ADMITTED] += 1
+            return f"[{self.node}] has {CONNECTIONS_MAX} connections, and accepts no more"
         return found.accept(fields, connection)
 
     def known_name(self, fields: Fields) -> str:

@@ -53,6 +53,8 @@ class CallerConnection(TcprosConnection):
         self._answering = 0  # the number of the request that is being handled; 0: none
         self._number = 0
         self._cancel: Cancel = _nothing
+        self._paused = False  # True while the caller does not read what was answered
+        self._handing = False  # True while requests are handed over: one that is answered at once is not the end
 
     def begin(self, header: bytes, *, probe: bool) -> None:
         """Answer the caller's header, and read requests."""
@@ -75,6 +77,13 @@ class CallerConnection(TcprosConnection):
             self.transport.pause_reading()
         self._next()
 
+    def pause_writing(self) -> None:
+        self._paused = True
+
+    def resume_writing(self) -> None:
+        self._paused = False
+        self._next()
+
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
         self._requests.clear()
@@ -86,17 +95,36 @@ class CallerConnection(TcprosConnection):
 
     def refuse(self) -> None:
         """Answer everything that waits with an error, and close the connection: the server is gone."""
-        text = _GONE.format(self._server.server.service)
+        failure = encode_failure(_GONE.format(self._server.server.service))
+        waiting = len(self._requests) if self._persistent else 0
+        self._requests.clear()
         if self._answering:
             self._cancel()
-            self._respond(self._answering, encode_failure(text))
+            self._respond(self._answering, failure)
+        if waiting and self.transport is not None:
+            self.transport.write(failure * waiting)
         self.close()
 
     def _next(self) -> None:
-        """Hand the next request to the server, unless one is being handled."""
-        if self._answering or not self._requests or self.transport is None:
+        """Hand requests to the server, one at a time, as long as they are answered at once."""
+        if self._handing:
             return
-        request = self._requests.popleft()
+        self._handing = True
+        try:
+            while self._requests and not self._answering and not self._paused and self._is_open:
+                self._hand_over(self._requests.popleft())
+        finally:
+            self._handing = False
+        transport = self.transport
+        if transport is not None and self._is_open and len(self._requests) < REQUESTS_MAX:
+            if not transport.is_reading():
+                transport.resume_reading()
+
+    @property
+    def _is_open(self) -> bool:
+        return self.transport is not None and not self.transport.is_closing()
+
+    def _hand_over(self, request: bytes) -> None:
         self._number += 1
         number = self._answering = self._number
         service = self._server.server.service
@@ -118,8 +146,6 @@ class CallerConnection(TcprosConnection):
         if not self._persistent:
             self.close()
             return
-        if len(self._requests) < REQUESTS_MAX and not self.transport.is_reading():
-            self.transport.resume_reading()
         self._next()
 
 

@@ -253,15 +253,15 @@ class XmlRpcServer:
         self._connections[task] = writer
         if len(self._connections) > CONNECTIONS_MAX:
             self._lost["XMLRPC connections over the limit"] += 1
-            next(iter(self._connections.values())).transport.abort()
+            self._connections.pop(next(iter(self._connections))).transport.abort()
         _send_at_once(writer)
         try:
-            while await self._answer(reader, writer):
+            while await self._answer(reader, writer) and task in self._connections:
                 self._connections[task] = self._connections.pop(task)  # the last to be closed for want of room
         except (OSError, asyncio.IncompleteReadError):
             pass  # the other end has closed it, which is how they all end
         finally:
-            del self._connections[task]
+            self._connections.pop(task, None)
             writer.close()
 
     async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:

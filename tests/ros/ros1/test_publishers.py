@@ -207,6 +207,41 @@ async def test_requests_of_one_connection_are_answered_in_turn_and_a_flood_is_no
     assert wire.reads
 
 
+async def test_thousands_of_requests_in_one_piece_are_answered_while_the_caller_reads() -> None:
+    node = Node()
+    node.user.serve = bytes
+    wire = node.connect(tcpros.encode_header(SET))
+    wire.sent()
+    wire.receive(tcpros.frame(b"") * 3000)
+    assert len(tcpros.ResponseReader().feed(wire.sent())) == 3000
+    wire.takes = False
+    wire.receive(tcpros.frame(b"large") * 3000)
+    assert (len(wire.held), wire.reads, len(node.user.requests)) == (len(b"\1\5\0\0\0large"), False, 3001)
+    wire.release()
+    assert (len(node.user.requests), wire.reads) == (6000, True)
+    node.user.serve = None
+    wire.sent()
+    wire.receive(tcpros.frame(b"a") * 3)
+    node.set.close()
+    assert len(tcpros.ResponseReader().feed(wire.sent())) == 3
+    assert len(node.user.requests) == 6001  # those that wait are refused, and not handled
+
+
+async def test_connections_over_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Connections that send no header keep out no other one, and subscribers and callers are not without a limit."""
+    monkeypatch.setattr("r2p.ros.ros1.connections.CONNECTIONS_MAX", 2)
+    node = Node()
+    silent = [node.connect() for _ in range(3)]
+    assert [each.closed for each in silent] == [True, False, False]
+    first = node.join()
+    node.connect(tcpros.encode_header(SET))
+    third = node.connect(tcpros.encode_header(CHAT))
+    assert b"[/talker] has 2 connections, and accepts no more" in third.sent()
+    assert (third.closed, len(node.chat.connections), node.context.lost["connection not admitted"]) == (True, 1, 3)
+    first.close()
+    assert not node.join().closed
+
+
 async def test_a_server_that_ends_refuses_and_a_caller_that_ends_cancels() -> None:
     node = Node()
     wire, gone = node.connect(tcpros.encode_header(SET)), node.connect(tcpros.encode_header(SET))

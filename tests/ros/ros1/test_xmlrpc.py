@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import socket
 import threading
 import xmlrpc.client
 import xmlrpc.server
@@ -237,6 +238,19 @@ async def test_connections_over_the_limit(server: XmlRpcServer, monkeypatch: pyt
     assert ended == [False, True, False]
     for client in clients:
         client.close()
+
+
+async def test_many_connections_at_once(server: XmlRpcServer) -> None:
+    """More than the limit are not kept even if all of them come in one turn of the event loop."""
+    with contextlib.ExitStack() as opened:
+        for _ in range(3 * module.CONNECTIONS_MAX):
+            raw = opened.enter_context(socket.socket())
+            raw.setblocking(False)
+            raw.connect_ex(("127.0.0.1", server.port))
+        async with asyncio.timeout(30.0):
+            while server._lost["XMLRPC connections over the limit"] < 2 * module.CONNECTIONS_MAX:
+                await asyncio.sleep(0)
+        assert len(server._connections) == module.CONNECTIONS_MAX
 
 
 async def test_a_server_that_closes_while_clients_do_not_read(server: XmlRpcServer) -> None:
