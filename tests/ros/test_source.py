@@ -56,6 +56,33 @@ def test_source_of_a_type_of_ros_has_its_bytes(name: str, version: int) -> None:
     assert cls().encode() == made().encode()
 
 
+NESTED = "\n" + "=" * 80 + "\nMSG: "
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "float32 str\nstring a\nstring[] b\nuint8[4] bytes\nfloat32[3] tuple\nfloat32 r2p\nfloat32[] c\ntime d",
+        "int32 int=3\nbool bool=true\nfloat32 float=inf\nint32 x=1\nbool y\nfloat32 z=nan\nstring str=a\nstring a",
+        "string ClassVar=b\nint8 c=1\nbool Annotated\nstring last\nfloat32 class\nfloat32 class_2",
+        f"Point Point\nPoint other\nHeader Header\nHeader h{NESTED}my_msgs/Point\nfloat32 x",
+        f"a/Point a\nb/Point b{NESTED}a/Point\nfloat32 x{NESTED}b/Point\nfloat32 y",
+        f"None a\nstr b\nr2p c\nstring d{NESTED}my_msgs/None\nbool x"
+        f"{NESTED}my_msgs/str\nbool y{NESTED}my_msgs/r2p\nbool z",
+        f"geometry_msgs/Point a\nPoint b{NESTED}geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z"
+        f"{NESTED}my_msgs/Point\nbool x",
+        "# A text\0 with\x1b[31m colours.\nfloat32 x",
+    ],
+)
+def test_source_of_types_with_names_that_python_uses(text: str) -> None:
+    definitions = parse("my_msgs/Odd", text)
+    made = RosTypes(1, definitions).load("my_msgs/Odd")
+    cls = run(source([made], definitions, 1000))["Odd"]
+    assert r2p.layout(cls).schema == r2p.layout(made).schema
+    assert cls().encode() == made().encode()
+    assert cls.__doc__.isprintable()
+
+
 def test_types_that_r2p_has_are_imported() -> None:
     definitions = definitions_of_ros("sensor_msgs/LaserScan", 2)
     assert RosTypes(2, definitions).load("sensor_msgs/LaserScan") is LaserScan

@@ -300,7 +300,7 @@ class TcprosListener:
         found = offered.get(name)
         if found is None:
             return f"[{self.node}] {verb} no [{name}]"
-        if sum(len(each.connections) for table in (self.topics, self.services) for each in table.values()) >= CONNECTIONS_MAX:
+        if sum(len(each.connections) for each in (*self.topics.values(), *self.services.values())) >= CONNECTIONS_MAX:
             self.context.lost[_ADMITTED] += 1
             return f"[{self.node}] has {CONNECTIONS_MAX} connections, and accepts no more"
         return found.accept(fields, connection)

@@ -115,10 +115,8 @@ class CallerConnection(TcprosConnection):
                 self._hand_over(self._requests.popleft())
         finally:
             self._handing = False
-        transport = self.transport
-        if transport is not None and self._is_open and len(self._requests) < REQUESTS_MAX:
-            if not transport.is_reading():
-                transport.resume_reading()
+        if self._is_open and len(self._requests) < REQUESTS_MAX and self.transport is not None:
+            self.transport.resume_reading()
 
     @property
     def _is_open(self) -> bool:
