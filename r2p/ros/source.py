@@ -105,8 +105,10 @@ class _ClassWriter:
     def _class(self, shape: Layout[Any], name: str) -> str:
         """Return the source of a class, after those that it needs are written."""
         definition = self._definitions.get(shape.name, MessageDefinition(shape.name, ()))
-        outer, names = self._members, [each.name for each in (*shape.fields, *definition.constants)]
-        self._members = frozenset(names)
+        outer = self._members
+        self._members = frozenset(
+            [*(each.name for each in shape.fields), *(each.name for each in definition.constants)]
+        )
         fields = [self._field(field) for field in shape.fields]
         constants = [self._constant(each) for each in definition.constants]
         self._members = outer

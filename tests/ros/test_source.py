@@ -57,6 +57,7 @@ def test_source_of_a_type_of_ros_has_its_bytes(name: str, version: int) -> None:
 
 
 NESTED = "\n" + "=" * 80 + "\nMSG: "
+POINT = f"{NESTED}geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z"
 
 
 @pytest.mark.parametrize(
@@ -67,10 +68,9 @@ NESTED = "\n" + "=" * 80 + "\nMSG: "
         "string ClassVar=b\nint8 c=1\nbool Annotated\nstring last\nfloat32 class\nfloat32 class_2",
         f"Point Point\nPoint other\nHeader Header\nHeader h{NESTED}my_msgs/Point\nfloat32 x",
         f"a/Point a\nb/Point b{NESTED}a/Point\nfloat32 x{NESTED}b/Point\nfloat32 y",
-        f"None a\nstr b\nr2p c\nstring d{NESTED}my_msgs/None\nbool x"
-        f"{NESTED}my_msgs/str\nbool y{NESTED}my_msgs/r2p\nbool z",
-        f"geometry_msgs/Point a\nPoint b{NESTED}geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z"
-        f"{NESTED}my_msgs/Point\nbool x",
+        f"None a\nstr b\nr2p c{NESTED}my_msgs/None\nbool x{NESTED}my_msgs/str\nbool y{NESTED}my_msgs/r2p\nbool z",
+        f"geometry_msgs/Point a\nPoint b{NESTED}geometry_msgs/Point\nfloat64[3] x{NESTED}my_msgs/Point\nbool x",
+        f"Point b\ngeometry_msgs/Point a\nint8 Point_{NESTED}my_msgs/Point\nbool x{POINT}",
         "# A text\0 with\x1b[31m colours.\nfloat32 x",
     ],
 )
