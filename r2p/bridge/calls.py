@@ -17,7 +17,7 @@ from r2p.codecs.services import Kind
 from r2p.log_lines import get_logger
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.transports.link import Link
-from r2p.transports.url import scheme_of, takes_key
+from r2p.transports.url import is_ros, scheme_of
 
 logger = get_logger("r2p.bridge")
 
@@ -127,5 +127,5 @@ class CallRelay:
 
 def permission_text(module: str, scheme: str) -> str:
     """Describe that a module needs permission for changes by a link of this scheme, and how to give it."""
-    key = ", or give the link a key (?key=FILE)" if takes_key(scheme) else ""
+    key = "" if is_ros(scheme) else ", or give the link a key (?key=FILE)"  # nodes of ROS know no keys
     return f"{module} refuses changes from {scheme}: start it with --allow-control{key}"

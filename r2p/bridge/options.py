@@ -21,12 +21,12 @@ from r2p.names import LOADER_PREFIX
 from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import SlotPublisher
-from r2p.transports.url import is_ip
+from r2p.transports.url import ROS, is_ip
 from r2p.units import SECOND
 
 T = TypeVar("T")
 
-PREFIX_ON = ("zenoh", "ros1", "ros2", "dds")
+PREFIX_ON = ("zenoh", *ROS)
 """The links where a prefix applies by default: networks that several robots share."""
 
 _CACHED_MAX = 1024  # names of links: each new client brings another one

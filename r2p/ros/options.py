@@ -12,12 +12,16 @@ from typing import Any, TypeVar
 import msgspec
 
 from r2p.clock import duration
+from r2p.errors import TransportError
 from r2p.ros.middleware import Qos
-from r2p.transports.url import yes_or_no
+from r2p.transports.url import Url, yes_or_no
 from r2p.units import SECOND
 
 ABSOLUTE = ("clock", "diagnostics", "diagnostics_agg", "parameter_events", "rosout", "tf", "tf_static")
 """Topics that ROS has once for all robots: no namespace is put before their names."""
+
+DOMAIN_MAX = 232
+"""The highest domain of ROS 2: those above have no ports in DDS."""
 
 T = TypeVar("T")
 
@@ -110,6 +114,24 @@ def qos_change(text: str) -> QosChange:
         else:
             raise ValueError(f"{part!r} is not a quality of service: {_QOS_FORM}")
     return QosChange(**given)
+
+
+def domain(text: str) -> int:
+    """Return a domain of ROS 2. Raises ValueError."""
+    if not text.isascii() or not text.isdecimal() or len(text) > len(str(DOMAIN_MAX)) or int(text) > DOMAIN_MAX:
+        raise ValueError(f"a domain of ROS is a number from 0 to {DOMAIN_MAX}")
+    return int(text)
+
+
+def domain_of(url: Url, parsed: Mapping[str, Any], environ: Mapping[str, str]) -> int:
+    """Return the domain of a URL's options, else that of ROS_DOMAIN_ID, else 0. Raises TransportError."""
+    if "domain" in parsed:
+        return int(parsed["domain"])
+    text = environ.get("ROS_DOMAIN_ID", "")
+    try:
+        return domain(text) if text else 0
+    except ValueError as error:
+        raise TransportError(f"{url}: ROS_DOMAIN_ID={text}: {error}") from None
 
 
 URL_OPTIONS: dict[str, Callable[[str], Any]] = {"ns": namespace, "ros_nodes": yes_or_no}

@@ -31,6 +31,7 @@ from r2p.tools.options import Format
 from r2p.tools.output import Output
 from r2p.tools.session import Session, Settings, UsageError, check_urls, join, settings, standalone, wait_until
 from r2p.transports.can.netlink import ARPHRD_CAN, Interface, has_socketcan, list_interfaces
+from r2p.transports.url import is_ros
 from r2p.units import MILLISECOND
 
 EXTRAS = {
@@ -357,7 +358,7 @@ async def try_link(session: Session) -> AsyncIterator[Check]:
             yield keys
             return
         await wait_until(lambda: bool(_named(session)) or not session.may_have_firmware(), _ROUND)
-        others = ros_checks.nodes(session) if ros_checks.is_ros(url) else _received(session, url)
+        others = ros_checks.nodes(session) if is_ros(url) else _received(session, url)
         for check in (*others, *_losses(session), *map(_notice, notices.values())):
             yield check
     finally:

@@ -11,7 +11,7 @@ import re
 import shutil
 import socket
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import msgspec
@@ -19,13 +19,14 @@ import typer
 
 import r2p
 from r2p.bridge import BridgeOptions, GatewayStatistics
-from r2p.bridge.options import PREFIX_ON, check_prefix, is_link, is_topic_pattern, parse_rule
+from r2p.bridge.options import PREFIX_ON, check_prefix, is_link, parse_rule
 from r2p.msg import GatewayStatus
 from r2p.names import module_name_from, topic_alias
 from r2p.tools import ros_gateway
-from r2p.tools.options import Format, Via, class_choice, hertz
+from r2p.tools.options import Format, Via, class_choice, hertz, topic_pairs, topic_pattern
 from r2p.tools.output import Output, aligned
 from r2p.tools.session import Settings, UsageError, check_urls, service, settings
+from r2p.transports.url import ROS
 
 logger = logging.getLogger("r2p.gateway")
 
@@ -104,12 +105,12 @@ async def command(
     options = BridgeOptions(
         allow=_rules(allow, "--allow", chosen.via),
         deny=_rules(deny, "--deny", chosen.via),
-        rate_limit={topic: hertz(value) for topic, value in _pairs(rate_limit, "--rate-limit", "TOPIC=HZ")},
+        rate_limit={topic: hertz(value) for topic, value in topic_pairs(rate_limit, "--rate-limit", "TOPIC=HZ")},
         read_only=_links(read_only, "--read-only", chosen.via),
         prefix=_prefix(prefix),
         prefix_on=_links(prefix_on, "--prefix-on", chosen.via) or PREFIX_ON,
-        classes={topic: class_choice(value) for topic, value in _pairs(class_, "--class", "TOPIC=CLASS")},
-        reserve=tuple(_topic(each, "--reserve") for each in reserve or ()),
+        classes={topic: class_choice(value) for topic, value in topic_pairs(class_, "--class", "TOPIC=CLASS")},
+        reserve=tuple(topic_pattern(each, "--reserve") for each in reserve or ()),
         allow_control=allow_control,
     )
     _check_effect(options, chosen.via)
@@ -167,7 +168,7 @@ def _check_effect(options: BridgeOptions, via: list[str]) -> None:
         )
     if options.prefix_on != PREFIX_ON and not options.prefix:
         raise UsageError(f"--prefix-on {options.prefix_on[0]} needs a --prefix, such as robot1/")
-    if options.reserve and kinds <= {*_LINES, "zenoh", "memory", *ros_gateway.SCHEMES}:
+    if options.reserve and kinds <= {*_LINES, "zenoh", "memory", *ROS}:
         raise UsageError("--reserve is for slots on RTCAN, and there is no such link: add --via rtcan:can0")
     if options.classes and kinds.isdisjoint(_LINES):
         raise UsageError(f"--class is for debug lines, and there is none: the links are {', '.join(via)}")
@@ -190,20 +191,6 @@ def _prefix(text: str) -> str:
         return check_prefix(text)
     except r2p.Error as error:
         raise UsageError(f"--prefix: {error}") from error
-
-
-def _pairs(given: _Rules, option: str, form: str) -> Iterable[tuple[str, str]]:
-    for text in given or ():
-        topic, equals, value = text.partition("=")
-        if not (topic and equals and value):
-            raise UsageError(f"{option} {text}: write it as {form}")
-        yield _topic(topic, option), value
-
-
-def _topic(pattern: str, option: str) -> str:
-    if not is_topic_pattern(pattern):
-        raise UsageError(f"{option}: no topic can match {pattern!r}: write a name, or a pattern such as enc*")
-    return pattern
 
 
 class Row(msgspec.Struct, frozen=True):

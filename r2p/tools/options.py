@@ -3,6 +3,7 @@
 Each is a type for a parameter of a command, as Typer reads it: `async def echo(session, *, timeout: Timeout = None)`.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,8 +11,10 @@ import typer
 
 import r2p
 from r2p.bridge import ClassOf
+from r2p.bridge.options import is_topic_pattern
 from r2p.clock import LONGEST, SHORTEST
 from r2p.names import topic_name
+from r2p.tools.config import UsageError
 from r2p.transports.url import duration
 
 CLASS_NAMES = {
@@ -98,3 +101,19 @@ All = Annotated[bool, typer.Option("--all", "-a", help="Include tools, whose nam
 Rate: Any = Annotated[
     float | None, typer.Option("--rate", "-r", parser=hertz, metavar="HZ", help="Messages per second; default: 1.")
 ]
+
+
+def topic_pattern(text: str, option: str) -> str:
+    """Return the name of a topic, or a pattern for names. Raises UsageError."""
+    if not is_topic_pattern(text):
+        raise UsageError(f"{option}: no topic can match {text!r}: write a name, or a pattern such as enc*")
+    return text
+
+
+def topic_pairs(given: list[str] | None, option: str, form: str) -> Iterator[tuple[str, str]]:
+    """Yield the two parts of each TOPIC=VALUE; topics may be written as in ROS, `/scan`. Raises UsageError."""
+    for text in given or ():
+        topic, equals, value = text.partition("=")
+        if not (topic and equals and value):
+            raise UsageError(f"{option} {text}: write it as {form}")
+        yield topic_pattern(topic.removeprefix("/"), option), value

@@ -1,7 +1,7 @@
 """What `r2p doctor` checks of a link to a ROS network: what ROS programs never say, and users search for longest.
 
 For ROS 1 these are the master, the address by which other nodes reach this computer, and whether this computer reaches
-each of them: a node that is registered under an address which nobody can reach is in all lists, and no data come.
+each of them: a node that is registered under an address which none of them reaches is in all lists, and no data come.
 """
 
 import asyncio
@@ -19,16 +19,9 @@ if TYPE_CHECKING:
     from r2p.ros.ros1.master import MasterClient
     from r2p.ros.ros1.xmlrpc import XmlRpcClient
 
-SCHEMES = frozenset({"ros1", "ros2", "dds"})
-
 _NAME = "/r2p_doctor"
 _ANSWER = 3.0  # seconds for the answer of a node
 _LOOPBACK = ("127.", "localhost", "::1")
-
-
-def is_ros(url: str) -> bool:
-    """Return whether a URL is that of a link to a ROS network."""
-    return url.partition(":")[0] in SCHEMES
 
 
 async def before(url: str) -> AsyncIterator[Check]:

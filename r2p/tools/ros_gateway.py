@@ -1,18 +1,15 @@
 """The options of a gateway to ROS: which types topics have, and how they are shown there."""
 
-from collections.abc import Iterable
 from typing import Annotated, Any
 
 import msgspec
 import typer
 
 import r2p
+from r2p.tools.options import topic_pairs
 from r2p.tools.session import Settings, UsageError
 from r2p.tools.types import Types, is_service, load_service, load_type
-from r2p.transports.url import open_transport, scheme_of
-
-SCHEMES = ("ros1", "ros2", "dds")
-"""The schemes of links to ROS."""
+from r2p.transports.url import is_ros, open_transport
 
 _Pairs = list[str] | None
 
@@ -44,14 +41,14 @@ def open_links(settings: Settings, given: RosGatewayOptions) -> list[Any]:
 
     Raises UsageError for options that can't be, or that have no effect, as no link leads to ROS.
     """
-    if not any(scheme_of(url) in SCHEMES for url in settings.via):
+    if not any(map(is_ros, settings.via)):
         for option, value in (("--type", given.types), ("--ros-type", given.ros_types), ("--qos", given.qos)):
             if value:
                 raise UsageError(f"{option} {value[0]} is for links to ROS, and there is none: add --via ros2:")
         if given.ros_nodes:
             raise UsageError("--ros-nodes is for links to ROS, and there is none: add --via ros2:")
         return list(settings.via)
-    return [_opened(url, _options(settings, given)) if scheme_of(url) in SCHEMES else url for url in settings.via]
+    return [_opened(url, _options(settings, given)) if is_ros(url) else url for url in settings.via]
 
 
 def _opened(url: str, options: Any) -> Any:
@@ -64,11 +61,11 @@ def _options(settings: Settings, given: RosGatewayOptions) -> Any:
     from r2p.ros.options import RosOptions, qos_change
 
     types = _stated_types(settings)
-    for topic, text in _pairs(given.types, "--type", "TOPIC=TYPE"):
+    for topic, text in topic_pairs(given.types, "--type", "TOPIC=TYPE"):
         types[topic] = _load(topic, text, settings)
-    ros_types = {topic: _ros_type(text) for topic, text in _pairs(given.ros_types, "--ros-type", "TOPIC=PKG/NAME")}
+    ros_types = {topic: _ros_type(text) for topic, text in topic_pairs(given.ros_types, "--ros-type", "TOPIC=PKG/NAME")}
     qos = {}
-    for topic, text in _pairs(given.qos, "--qos", "TOPIC=QOS"):
+    for topic, text in topic_pairs(given.qos, "--qos", "TOPIC=QOS"):
         try:
             qos[topic] = qos_change(text)
         except ValueError as error:
@@ -101,11 +98,3 @@ def _ros_type(text: str) -> str:
     if len(parts) not in (2, 3) or not all(parts):
         raise UsageError(f"--ros-type: {text!r} is not the name of a ROS type, such as sensor_msgs/Imu")
     return text
-
-
-def _pairs(given: _Pairs, option: str, form: str) -> Iterable[tuple[str, str]]:
-    for text in given or ():
-        topic, equals, value = text.partition("=")
-        if not (topic and equals and value):
-            raise UsageError(f"{option} {text}: write it as {form}")
-        yield topic.removeprefix("/"), value

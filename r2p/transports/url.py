@@ -38,9 +38,10 @@ BUILT_IN = {
 
 GROUP = "r2p.transports"
 
-_IP = frozenset({"dds", "ros1", "ros2", "tcp", "tcp-listen", "zenoh"})
+ROS = ("ros1", "ros2", "dds")
+"""The schemes of links to ROS networks."""
 
-_KEYLESS = frozenset({"ros1", "ros2", "dds"})
+_IP = frozenset({*ROS, "tcp", "tcp-listen", "zenoh"})
 
 _OPTIONS = re.compile(r"[?,&]")
 _CAN = re.compile(r"[a-z]*can[0-9]+")
@@ -119,9 +120,20 @@ def is_ip(link: str) -> bool:
     return scheme_of(link) in _IP
 
 
-def takes_key(scheme: str) -> bool:
-    """Return whether links of this scheme can have a key; nodes of ROS know none."""
-    return scheme not in _KEYLESS
+def is_ros(link: str) -> bool:
+    """Return whether a link, by its name or URL, is one to a ROS network."""
+    return scheme_of(link) in ROS
+
+
+def one_of(*values: str) -> Callable[[str], str]:
+    """Return a converter for an option that has one of these values."""
+
+    def check(text: str) -> str:
+        if text not in values:
+            raise ValueError(f"use one of {', '.join(values)}")
+        return text
+
+    return check
 
 
 def key_file(text: str) -> SharedKey:

@@ -17,7 +17,7 @@ from r2p.msg import GatewayStatus, Led
 from r2p.testing.network import node_in
 from r2p.tools import gateway
 from r2p.tools.gateway import LiveTable, RateCounter, crop, serve, table
-from r2p.tools.options import class_choice
+from r2p.tools.options import class_choice, topic_pairs
 from r2p.tools.output import Output
 from r2p.tools.session import Settings, UsageError
 
@@ -155,9 +155,9 @@ def test_mistakes_are_told() -> None:
         with pytest.raises(r2p.Error, match="is not a valid prefix"):
             Policy(BridgeOptions(prefix=prefix))
     with pytest.raises(UsageError, match="--rate-limit leds: write it as TOPIC=HZ"):
-        list(gateway._pairs(["leds"], "--rate-limit", "TOPIC=HZ"))
+        list(topic_pairs(["leds"], "--rate-limit", "TOPIC=HZ"))
     with pytest.raises(UsageError, match="--rate-limit: no topic can match 'leds@tcp'"):
-        list(gateway._pairs(["leds@tcp=5"], "--rate-limit", "TOPIC=HZ"))
+        list(topic_pairs(["leds@tcp=5"], "--rate-limit", "TOPIC=HZ"))
     with pytest.raises(typer.BadParameter, match="periodic:10ms"):
         class_choice("often")
 

@@ -45,7 +45,9 @@ def test_a_bad_value_is_named() -> None:
 
 
 def test_an_unknown_scheme_lists_the_known_ones() -> None:
-    with pytest.raises(TransportError, match=r"unknown transport 'tpc': use one of memory, .*rtcan, serial, sim, tcp"):
+    with pytest.raises(
+        TransportError, match=r"unknown transport 'tpc': use one of dds, memory, .*can, serial, sim, tcp"
+    ):
         open_transport("tpc:host")
 
 

@@ -19,14 +19,11 @@ from typing import TYPE_CHECKING
 from r2p.errors import TransportError
 from r2p.ros.link import RosTransport
 from r2p.ros.middleware import Middleware
-from r2p.ros.options import URL_OPTIONS, from_parsed
+from r2p.ros.options import URL_OPTIONS, domain, domain_of, from_parsed
 from r2p.transports.url import Url
 
 if TYPE_CHECKING:
     from r2p.transports.link import Hub
-
-DOMAIN_MAX = 232
-"""The highest domain whose ports exist."""
 
 
 def from_url(url: Url) -> RosTransport:
@@ -36,11 +33,11 @@ def from_url(url: Url) -> RosTransport:
     """
     if url.address:
         raise TransportError(f"{url}: DDS finds the others by itself: write dds:, or dds:?domain=3&interface=eth0")
-    parsed = url.parsed({**URL_OPTIONS, "domain": _domain, "interface": _interface})
+    parsed = url.parsed({**URL_OPTIONS, "domain": domain, "interface": _interface})
     options = from_parsed(parsed)
-    domain = parsed.get("domain", _domain_of_environment(os.environ))
+    number = domain_of(url, parsed, os.environ)
     interface = parsed.get("interface", _interface_of_environment(os.environ))
-    name = f"dds:?domain={domain}" if domain else "dds:"
+    name = f"dds:?domain={number}" if number else "dds:"
 
     def make(hub: "Hub") -> Middleware:
         try:
@@ -49,15 +46,9 @@ def from_url(url: Url) -> RosTransport:
             if (error.name or "").partition(".")[0] != "cyclonedds":
                 raise
             raise TransportError("dds: cyclonedds is missing: pip install 'r2p[dds]'") from error
-        return DdsMiddleware(domain, interface, hub.space.clock)
+        return DdsMiddleware(number, interface, hub.space.clock)
 
     return RosTransport(name, make, options)
-
-
-def _domain(text: str) -> int:
-    if not text.isdecimal() or int(text) > DOMAIN_MAX:
-        raise ValueError(f"a domain is a number from 0 to {DOMAIN_MAX}")
-    return int(text)
 
 
 def _interface(text: str) -> str:
@@ -65,14 +56,6 @@ def _interface(text: str) -> str:
     if text not in names:
         raise ValueError(f"this computer has no such network interface; it has {', '.join(names)}")
     return text
-
-
-def _domain_of_environment(environment: Mapping[str, str]) -> int:
-    text = environment.get("ROS_DOMAIN_ID") or "0"
-    try:
-        return _domain(text)
-    except ValueError as error:
-        raise TransportError(f"dds: ROS_DOMAIN_ID={text}: {error}") from error
 
 
 def _interface_of_environment(environment: Mapping[str, str]) -> str:

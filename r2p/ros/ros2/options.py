@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from r2p.errors import TransportError
-from r2p.ros.options import URL_OPTIONS, RosOptions, from_parsed
-from r2p.transports.url import Url
+from r2p.ros.options import URL_OPTIONS, RosOptions, domain, domain_of, from_parsed
+from r2p.transports.url import Url, one_of
 from r2p.transports.zenoh.config import ZenohOptions, build_config, connection_settings, endpoint_text, plain_text
 
 if TYPE_CHECKING:  # imported when it is used: a URL can be checked without zenoh
@@ -22,9 +22,6 @@ if TYPE_CHECKING:  # imported when it is used: a URL can be checked without zeno
 
 DEFAULT_ENDPOINT = "tcp/localhost:7447"
 """Where rmw_zenoh expects its router."""
-
-DOMAIN_MAX = 232
-"""The largest domain in ROS."""
 
 _NEEDED = {"timestamping/enabled": "true"}
 """Without it there are no transient local publishers: what they keep is in the order of its stamps."""
@@ -68,7 +65,7 @@ def parse_options(url: Url, environ: Mapping[str, str] = os.environ) -> Ros2Opti
         shm=None if "shm" not in given else given["shm"] == "on",
         config=None if config is None else Path(config),
     )
-    domain = given["domain"] if "domain" in given else _domain_of(environ)
+    domain = domain_of(url, given, environ)
     return Ros2Options(name, domain, zenoh, ros, _overrides(environ.get("ZENOH_CONFIG_OVERRIDE", "")))
 
 
@@ -96,20 +93,6 @@ def _insert(config: "zenoh.Config", settings: Mapping[str, str]) -> None:
         config.insert_json5(key, value)
 
 
-def _domain(text: str) -> int:
-    if not text.isascii() or not text.isdecimal() or len(text) > len(str(DOMAIN_MAX)) or int(text) > DOMAIN_MAX:
-        raise ValueError(f"a domain of ROS is a number from 0 to {DOMAIN_MAX}")
-    return int(text)
-
-
-def _domain_of(environ: Mapping[str, str]) -> int:
-    text = environ.get("ROS_DOMAIN_ID", "")
-    try:
-        return _domain(text) if text else 0
-    except ValueError as error:
-        raise TransportError(f"ROS_DOMAIN_ID={text}: {error}") from None
-
-
 def _overrides(text: str) -> dict[str, str]:
     """Return the settings in `KEY=VALUE;KEY=VALUE`. Raises TransportError."""
     found: dict[str, str] = {}
@@ -121,19 +104,10 @@ def _overrides(text: str) -> dict[str, str]:
     return found
 
 
-def _one_of(*values: str) -> Callable[[str], str]:
-    def check(text: str) -> str:
-        if text not in values:
-            raise ValueError(f"use one of {', '.join(values)}")
-        return text
-
-    return check
-
-
 PARSERS: dict[str, Callable[[str], Any]] = {
-    "domain": _domain,
-    "mode": _one_of("client", "peer"),
+    "domain": domain,
+    "mode": one_of("client", "peer"),
     "config": str,
-    "shm": _one_of("on", "off"),
+    "shm": one_of("on", "off"),
 }
 """The options of the URL that other ROS links do not have, and what converts them."""

@@ -15,7 +15,7 @@ import msgspec
 
 from r2p.errors import TransportError
 from r2p.keys import SharedKey
-from r2p.transports.url import Url, key_file
+from r2p.transports.url import Url, key_file, one_of
 from r2p.transports.zenoh.diagnose import ConnectionSettings, Tls
 
 if TYPE_CHECKING:  # imported when it is used: a URL can be checked without zenoh, and loading it takes long
@@ -119,15 +119,6 @@ def _default_mode(endpoint: str | None, config: str | None) -> str | None:
     return None if config is not None else "peer"
 
 
-def _one_of(*values: str) -> Callable[[str], str]:
-    def check(text: str) -> str:
-        if text not in values:
-            raise ValueError(f"use one of {', '.join(values)}")
-        return text
-
-    return check
-
-
 def _network_name(text: str) -> str:
     if not is_network_name(text):
         raise ValueError("a network's name has 1 to 64 letters, digits, dots, dashes and underscores")
@@ -157,12 +148,12 @@ def endpoint_text(text: str) -> str:
 
 
 _PARSERS: dict[str, Callable[[str], Any]] = {
-    "mode": _one_of(*MODES),
+    "mode": one_of(*MODES),
     "listen": endpoint_text,
     "network": _network_name,
-    "scouting": _one_of("on", "off"),
-    "batching": _one_of("on", "off"),
-    "shm": _one_of("on", "off"),
+    "scouting": one_of("on", "off"),
+    "batching": one_of("on", "off"),
+    "shm": one_of("on", "off"),
     "config": _file_name,
     "key": key_file,
 }

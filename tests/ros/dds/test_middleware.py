@@ -160,7 +160,7 @@ async def test_modules_meet_on_a_domain(domain: int) -> None:
     ("url", "error"),
     [
         ("dds:eth0", "DDS finds the others by itself: write dds:, or dds:.domain=3&interface=eth0"),
-        ("dds:?domain=233", "a domain is a number from 0 to 232"),
+        ("dds:?domain=233", "a domain of ROS is a number from 0 to 232"),
         ("dds:?interface=nope9", "has no such network interface; it has .*lo"),
         ("dds:?topic=x", "has no option 'topic'; it knows: domain, interface, ns, ros_nodes"),
     ],
@@ -185,5 +185,6 @@ async def test_the_environment_of_ros_counts(monkeypatch: pytest.MonkeyPatch, do
         async with r2p.Module("PC3", via="dds:"):
             pass
     monkeypatch.setenv("ROS_DOMAIN_ID", "x")
-    with pytest.raises(TransportError, match="ROS_DOMAIN_ID=x: a domain is a number"):
+    with pytest.raises(TransportError, match="ROS_DOMAIN_ID=x: a domain of ROS is a number"):
         open_transport("dds:")
+    open_transport("dds:?domain=3")  # what the URL says does not need it
