@@ -11,6 +11,7 @@ tf            transforms, /tf
 library       the definitions that come with ROS, and what the ends of a connection compare of a type
 source        Python source of message classes
 packages      packages for ROS with the types of r2p's classes
+transport     makes a link to a ROS network, and its middleware, and runs both
 link          a link to a ROS network; discovery, registrations: what is there, and what this side has there; gateways:
               how those on ROS find each other
 topics        how topics travel; topic_classes, graph_names, qos, options: their types, names and quality of service;

@@ -8,27 +8,24 @@ its class known (`TopicClasses`), and so how it travels (`RosTopic`), it is regi
 (`Registrations`), as that of ROS nodes.
 """
 
-import asyncio
 import functools
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, ClassVar
 
 import msgspec
 
-from r2p.clock import REAL_TIME, in_background
+from r2p.clock import REAL_TIME
 from r2p.codecs.management import ANY_TYPE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.errors import DecodeError, MessageError, TransportError
+from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, layout
 from r2p.names import LOG, SERVICE_SUFFIXES
 from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import TopicType
 from r2p.ros import type_descriptions
 from r2p.ros.background import BackgroundResults
-from r2p.ros.clock import publishes_clock, ros_time
 from r2p.ros.discovery import GATEWAYS, RosDiscovery
 from r2p.ros.gateways import GatewayExchange, sender_of
 from r2p.ros.graph_names import GraphNames
-from r2p.ros.library import load_definitions
 from r2p.ros.middleware import (
     Answer,
     Cancel,
@@ -40,24 +37,19 @@ from r2p.ros.middleware import (
     RosGraph,
     RosPeerEndpoint,
 )
-from r2p.ros.options import RosOptions, lookup, merged
+from r2p.ros.options import RosOptions, lookup
 from r2p.ros.qos import publisher_qos, subscriber_qos
-from r2p.ros.registrations import Registrations
+from r2p.ros.registrations import TYPE_UNKNOWN, NotOnRos, Registrations
 from r2p.ros.services import RosServices, ServiceArrival
 from r2p.ros.topic_classes import TopicClasses
 from r2p.ros.topics import RosTopic, TopicTypes, is_own
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.buffered_link import BufferedLink
-from r2p.transports.link import Hub, Transport, unique_name
+from r2p.transports.link import Hub, unique_name
 from r2p.transports.stats import LoggedCounter
-from r2p.transports.url import open_transport
 
 _GATEWAYS_KEY = GATEWAYS.encode()
-_OFF_ROS_AFTER_S = 3.0  # from when a topic is not on ROS until that is reported: its type may be on its way
-
-_UNKNOWN = "type unknown"
-_NOT_ON_ROS = "not on ROS"
 _NOTHING = TopicType(), TopicType()
 _ROLES = (ROLE_PUBLISHES, ROLE_SUBSCRIBES)
 
@@ -91,8 +83,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._ros = RosDiscovery(hub.space.module, hub.instance, self.names, review, taken, counts)
         super().__init__(name, hub, discovery=self._ros)
         middleware.lost = self.stats.lost
-        self.off_ros: dict[str, str] = {}
-        """The topics that are not on the ROS network, and why."""
+        self._not_on_ros = NotOnRos("", hub.space.loop, self.stats.lost, self.notice)
         self._types = TopicTypes(middleware.version, options, hub.space.module, self.stats.lost)
         self._background = BackgroundResults(hub.space.loop, self._touch)
         self._classes = TopicClasses(hub, self._types, self._background, self._describe, self._touch)
@@ -111,8 +102,6 @@ class RosLink(BufferedLink, MiddlewareUser):
         """The ROS nodes whose messages of a topic arrive."""
         self._latched: set[str] = set()
         """Topics that a ROS node latches."""
-        self._reported: set[str] = set()
-        """Topics that were reported as not on ROS."""
         self._sources: dict[str, Source] = {}
         self._received_at = 0  # UTC in ns, of the last messages
         self._gateways = GatewayExchange(middleware, self._registrations, hub.space.clock)
@@ -145,7 +134,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         publishes, subscribes = (topic, ROLE_PUBLISHES) in own, (topic, ROLE_SUBSCRIBES) in own
         name = self.names.to_ros(topic)
         travel, reason = self._travel(topic, name) if publishes or subscribes else (None, "")
-        self._note_off_ros(topic, reason)
+        self._not_on_ros.note(topic, reason)
         if travel is None and not reason and (publishes or subscribes) and self._background.is_pending(topic):
             return  # until it is known, it stays as it is: other nodes are connected
         if travel is None or name is None:
@@ -181,7 +170,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         cls = self.class_of(topic, peers)
         if cls is None:
             is_waiting = not peers and self._elsewhere(topic) == _NOTHING  # for a publisher: nothing is wrong yet
-            return None, "" if is_waiting else _UNKNOWN
+            return None, "" if is_waiting else TYPE_UNKNOWN
         if misfit := self._misfit(topic, cls):
             return None, misfit
         types = frozenset(each.type for each in peers if each.type)
@@ -291,31 +280,12 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     # What is reported
 
-    def _note_off_ros(self, topic: str, reason: str) -> None:
-        """Note why a topic is not on the ROS network; empty if it is. It is reported and counted if it stays so."""
-        if not reason:
-            self.off_ros.pop(topic, None)
-            return
-        is_new = topic not in self.off_ros
-        self.off_ros[topic] = reason
-        if is_new:
-            in_background(self._space.loop.call_later(_OFF_ROS_AFTER_S, self._report_off_ros, topic))
-
-    def _report_off_ros(self, topic: str) -> None:
-        reason = self.off_ros.get(topic)
-        if reason is None or self._closed or topic in self._reported:
-            return
-        self._reported.add(topic)
-        self.stats.lost[_NOT_ON_ROS] += 1
-        advice = f": give --type {topic}=TYPE" if reason == _UNKNOWN else ""
-        self.notice(_NOT_ON_ROS, f"{topic} is not on ROS: {reason}{advice}", trouble=False)
-
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
         waits = ", waits for room" if publisher_class is PublisherClass.NON_REAL_TIME else ""
         return f"reliable to ROS nodes that keep up, in order{waits}"
 
     def not_carried(self) -> dict[str, str]:
-        return self.off_ros | self.services.off_ros
+        return self._not_on_ros.reasons | self.services.not_on_ros.reasons
 
     async def _describe(self, peer: RosPeerEndpoint) -> str:
         """Return the definition of another node's type: of the middleware, else of the node itself."""
@@ -343,7 +313,7 @@ class RosLink(BufferedLink, MiddlewareUser):
             if topic in self.services:
                 self.services.write(topic, sample)
                 return
-            self.stats.lost[_NOT_ON_ROS] += 1
+            self.stats.lost["not on ROS"] += 1
             return
         try:
             messages = published.encode(sample)
@@ -416,6 +386,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self.middleware.resume()
 
     def close(self) -> None:
+        self._not_on_ros.close()
         self._registrations.close()
         self.services.close()
         self._classes.close()
@@ -505,47 +476,3 @@ def _topic_type(travel: RosTopic) -> TopicType:
 def _class_type(cls: type[Message]) -> TopicType:
     shape = layout(cls)
     return TopicType(shape.size, shape.fingerprint, shape.varies)
-
-
-MakeMiddleware = Callable[[Hub], Middleware]
-
-
-class RosTransport(Transport):
-    """Makes the middleware of a ROS network, and one link with this `name`, such as `ros2:`."""
-
-    def __init__(self, name: str, make_middleware: MakeMiddleware, options: RosOptions | None = None) -> None:
-        self.options = options or RosOptions()
-        self._name = name
-        self._make_middleware = make_middleware
-
-    async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
-        middleware = self._make_middleware(hub)
-        if not hub.space.clock.virtual:  # now, and not while messages flow
-            await asyncio.to_thread(load_definitions, middleware.version)
-        link = RosLink(self._name, hub, middleware, self.options)
-        hub.attach(link)
-        try:
-            if publishes_clock(hub.space):
-                middleware.set_sim_time()
-            async with ros_time(hub.space):
-                REAL_TIME.set(True)  # in this task, and in what it starts
-                await self.run_link(hub, link, opened)
-        finally:
-            link.close()
-            hub.detach(link)
-
-    async def run_link(self, hub: Hub, link: RosLink, opened: Callable[[], object]) -> None:
-        """Run the middleware of a link, and what a network has beside topics and services."""
-        await link.middleware.run(link, opened)
-
-
-def ros_transport(transport: Transport | str, options: RosOptions) -> RosTransport:
-    """Return a transport of ROS, or that of a URL, with these options added to its own.
-
-    Raises TransportError for any other transport, and for an invalid URL.
-    """
-    opened = open_transport(transport) if isinstance(transport, str) else transport
-    if not isinstance(opened, RosTransport):
-        raise TransportError(f"{transport} is not a link to ROS: write ros1:, ros2: or dds:")
-    opened.options = merged(opened.options, options)
-    return opened

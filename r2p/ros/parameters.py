@@ -21,9 +21,10 @@ from r2p.parameters.definition import ParameterInfo
 from r2p.ros import parameter_messages as messages
 from r2p.ros import type_descriptions
 from r2p.ros.exposed_parameters import ExposedParameters
-from r2p.ros.link import RosLink, RosTransport
+from r2p.ros.link import RosLink
 from r2p.ros.middleware import Answer, Cancel, Qos, Refuse, RosEndpoint, RosServer
 from r2p.ros.registrations import CALLS, RosClient
+from r2p.ros.transport import RosTransport
 from r2p.transports.link import Hub
 
 EVENTS = "/parameter_events"

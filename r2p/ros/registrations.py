@@ -1,5 +1,5 @@
 """What a link has registered at its middleware: ROS nodes, publishers and subscribers, by the topics of this side, and
-servers, by the services.
+servers, by the services; and what is not registered, and why.
 """
 
 import asyncio
@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from r2p.clock import Alarm, clock_of
+from r2p.clock import Alarm, clock_of, in_background
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.discovery.directory import decrement
 from r2p.ros.middleware import Middleware, RosEndpoint, RosServer
@@ -162,6 +162,54 @@ class Registrations:
             self._gone(node)
             self._middleware.remove_node(node)
             self.nodes.remove(node)
+
+
+TYPE_UNKNOWN = "type unknown"
+"""The reason of a topic or service whose class no program here knows."""
+
+_REPORTED_AFTER_S = 3.0
+"""Seconds until it is reported that a topic or service is not on ROS: its type may be on its way."""
+
+
+class NotOnRos:
+    """The topics, or the services, of this side that are not on the ROS network, and why.
+
+    Each one is reported and counted once, if it stays so. `what` comes before its name: "service ", or nothing.
+    """
+
+    def __init__(
+        self, what: str, loop: asyncio.AbstractEventLoop, lost: Counter[str], notice: Callable[..., object]
+    ) -> None:
+        self.reasons: dict[str, str] = {}
+        self._what = what
+        self._loop = loop
+        self._lost = lost
+        self._notice = notice
+        self._reported: set[str] = set()
+        self._closed = False
+
+    def note(self, name: str, reason: str) -> None:
+        """Note why a topic or service is not on the ROS network; empty if it is."""
+        if not reason:
+            self.reasons.pop(name, None)
+            return
+        is_new = name not in self.reasons
+        self.reasons[name] = reason
+        if is_new:
+            in_background(self._loop.call_later(_REPORTED_AFTER_S, self._report, name))
+
+    def close(self) -> None:
+        """Report nothing more."""
+        self._closed = True
+
+    def _report(self, name: str) -> None:
+        reason = self.reasons.get(name)
+        if reason is None or self._closed or name in self._reported:
+            return
+        self._reported.add(name)
+        self._lost[f"{self._what}not on ROS"] += 1
+        advice = f": give --type {name}=TYPE" if reason == TYPE_UNKNOWN else ""
+        self._notice("not on ROS", f"{self._what}{name} is not on ROS: {reason}{advice}", trouble=False)
 
 
 def _sorted(endpoints: Collection[Registered]) -> list[Registered]:

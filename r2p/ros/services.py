@@ -14,7 +14,6 @@ from typing import Any, Protocol, cast
 
 import msgspec
 
-from r2p.clock import in_background
 from r2p.codecs import services
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.codecs.services import HEADER_SIZE, REQUESTS, RESPONSES, ServiceHeader
@@ -37,7 +36,7 @@ from r2p.ros.middleware import (
     RosServer,
 )
 from r2p.ros.options import RosOptions, lookup
-from r2p.ros.registrations import CALLS, SERVES, Registrations, RosClient
+from r2p.ros.registrations import CALLS, SERVES, TYPE_UNKNOWN, NotOnRos, Registrations, RosClient
 from r2p.ros.service_calls import UNKNOWN_LIFETIME, CarriedService, RosCalls, RosRequests
 from r2p.ros.service_types import RosServiceCodec, ServiceShape, service_codec, service_shape, service_type
 from r2p.runtime.sample import PublisherClass, Sample, Source
@@ -52,9 +51,6 @@ _OF_EACH_NODE = frozenset({"rcl_interfaces", "type_description_interfaces", "ros
 _OF_EACH_NODE_OF_ROS1 = ("/get_loggers", "/set_logger_level")
 """How these services end where types are not known."""
 
-_UNKNOWN = "type unknown"
-_OFF_ROS_AFTER_S = 2.0
-"""Seconds after which it is said of a service that it is not on ROS: until then its type may be learnt."""
 _NOTICES_MAX = 256
 """Different notices of one link; further ones are left out."""
 
@@ -92,14 +88,13 @@ class RosServices:
     """The services of one link."""
 
     def __init__(self, link: ServiceLink, hub: Hub, discovery: RosDiscovery, registrations: Registrations) -> None:
-        self.off_ros: dict[str, str] = {}
-        """The services of this side that are not on the ROS network, and why."""
         self._link = link
         self._space = hub.space
         self._discovery = discovery
         self._registrations = registrations
         loop, clock = hub.space.loop, hub.space.clock
         lost = discovery.counts
+        self.not_on_ros = NotOnRos("service ", loop, lost, link.notice)
         self._calls = RosCalls(link.middleware, loop, clock, self._deliver, self._report, lost)
         self._requests = RosRequests(hub.random.getrandbits(32) | 1, loop, clock, self._deliver, lost)
         self._carried: dict[str, CarriedService] = {}
@@ -113,6 +108,7 @@ class RosServices:
 
     def close(self) -> None:
         """End all calls."""
+        self.not_on_ros.close()
         self._calls.close()
         self._requests.close()
 
@@ -243,25 +239,11 @@ class RosServices:
         try:
             layouts = self._layouts(name)
             codec = None if layouts is None else _codec_of(*layouts, self._link.middleware.version)
-            reason = _UNKNOWN if layouts is None else ""
+            reason = TYPE_UNKNOWN if layouts is None else ""
         except MessageError as error:
             codec, reason = None, str(error)
-        if not reason:
-            self.off_ros.pop(name, None)
-            return codec
-        if name not in self.off_ros:
-            in_background(self._space.loop.call_later(_OFF_ROS_AFTER_S, self._report_off_ros, name))
-        self.off_ros[name] = reason
+        self.not_on_ros.note(name, reason)
         return codec
-
-    def _report_off_ros(self, name: str) -> None:
-        """Report and count a service that is not on the ROS network, if it stayed so."""
-        reason = self.off_ros.get(name)
-        if reason is None or not self._may_notice("not on ROS", name):
-            return
-        self._discovery.counts["service not on ROS"] += 1
-        advice = f": give --type {name}=TYPE" if reason == _UNKNOWN else ""
-        self._link.notice("not on ROS", f"service {name} is not on ROS: {reason}{advice}", trouble=False)
 
     def _may_notice(self, kind: str, what: str) -> bool:
         """Return whether this was not said yet, as long as not too much was."""

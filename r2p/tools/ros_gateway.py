@@ -52,7 +52,7 @@ def open_links(settings: Settings, given: RosGatewayOptions) -> list[Any]:
 
 
 def _opened(url: str, options: Any) -> Any:
-    from r2p.ros.link import ros_transport  # only where it is used: it takes as long as the rest of the command
+    from r2p.ros.transport import ros_transport  # only where it is used: it takes as long as the rest of the command
 
     return ros_transport(open_transport(url), options)
 

@@ -22,7 +22,6 @@ from r2p.errors import NoServer, ServiceError
 from r2p.messages import Message, layout
 from r2p.ros.cdr import cdr
 from r2p.ros.classes import definitions_of
-from r2p.ros.link import RosTransport
 from r2p.ros.middleware import (
     Middleware,
     MiddlewareUser,
@@ -38,6 +37,7 @@ from r2p.ros.middleware import (
 )
 from r2p.ros.options import RosOptions
 from r2p.ros.topics import ros_type
+from r2p.ros.transport import RosTransport
 
 QOS = Qos()
 

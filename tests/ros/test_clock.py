@@ -11,8 +11,8 @@ import r2p.sim
 from r2p.clock import REAL_TIME
 from r2p.messages import Timestamp
 from r2p.ros.clock import RosClock
-from r2p.ros.link import RosTransport
 from r2p.ros.middleware import MiddlewareUser
+from r2p.ros.transport import RosTransport
 from r2p.testing.network import node_in
 from r2p.units import MILLISECOND, SECOND
 from tests.ros.fake import FakeMiddleware, FakeRosNetwork

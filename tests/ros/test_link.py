@@ -13,10 +13,10 @@ from r2p.messages import Timestamp
 from r2p.msg import IMU, Header, Log, String, Velocity3
 from r2p.names import TOPIC, module_path, node_name, topic_name
 from r2p.ros.graph_names import GraphNames
-from r2p.ros.link import ros_transport
 from r2p.ros.middleware import Qos, RosType
 from r2p.ros.options import QosChange, RosOptions, namespace, qos_change
 from r2p.ros.topics import ros_class
+from r2p.ros.transport import ros_transport
 from r2p.testing.network import Network, node_in
 from tests.ros.fake import FakeRosNetwork
 

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from r2p.msg import Encoder, Velocity3
-from r2p.ros.link import RosTransport
 from r2p.ros.options import QosChange
+from r2p.ros.transport import RosTransport
 from r2p.tools.gateway import Row, table
 from r2p.tools.ros_gateway import RosGatewayOptions, open_links
 from r2p.tools.session import Settings, UsageError

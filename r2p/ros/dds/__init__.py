@@ -17,9 +17,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from r2p.errors import TransportError
-from r2p.ros.link import RosTransport
 from r2p.ros.middleware import Middleware
 from r2p.ros.options import URL_OPTIONS, domain, domain_of, from_parsed
+from r2p.ros.transport import RosTransport
 from r2p.transports.url import Url
 
 if TYPE_CHECKING:

@@ -4,11 +4,12 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, cast
 
-from r2p.ros.link import RosLink, RosTransport
+from r2p.ros.link import RosLink
 from r2p.ros.options import RosOptions
 from r2p.ros.ros1.environment import RosAddress
 from r2p.ros.ros1.middleware import Ros1Middleware
 from r2p.ros.ros1.parameters import ParameterMirror, node_names
+from r2p.ros.transport import RosTransport
 from r2p.transports.link import Hub
 
 if TYPE_CHECKING:
