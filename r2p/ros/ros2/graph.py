@@ -68,7 +68,7 @@ class TokenGraph:
         del self._peers[token.kind][key]
         if token.kind == EntityKind.NODE:
             return token
-        del self._by_gid[gid_of(key)]
+        self._by_gid.pop(gid_of(key), None)  # it may be gone: made-up tokens may have one gid
         index = token.kind, token.name
         self._by_name[index].pop(key)
         if not self._by_name[index]:

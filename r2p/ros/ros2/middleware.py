@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 _BACKOFF_MAX_S = 0.5  # seconds between two attempts to open a session
 _ALONE_S = 3.0  # seconds without any ROS node until other domains are looked at
 _ALONE_TOOL_S = 0.3  # the same for a tool
+_CLIENTS_MAX = 256  # of services; more only while all of them have calls
 _DIAGNOSE_EVERY_S = 1.0  # seconds between two checks whether a session that is down should be explained
 
 _START_ROUTER = "start it with `ros2 run rmw_zenoh_cpp rmw_zenohd`; any zenoh 1 router will do"
@@ -303,11 +304,19 @@ class Ros2Middleware(Middleware):
         session = self._session
         if session is None or not self._up:
             raise NoServer(f"{service}: {self._options.name} is not connected to zenoh's router")
-        client = self._clients.get((node, service, type))
+        client = self._clients.pop((node, service, type), None)
         if client is None:
-            client = self._clients[node, service, type] = RmwClient(session, node, service, type)
+            self._close_idle_clients()
+            client = RmwClient(session, node, service, type)
             self._added(client.token)
+        self._clients[node, service, type] = client  # the last to be closed for want of room
         return await client.call(request, timeout)
+
+    def _close_idle_clients(self) -> None:
+        """Make room for one more client: each service of each node that ever came may have been called once."""
+        idle = [key for key, client in self._clients.items() if client.is_idle]
+        for key in idle[: max(0, len(self._clients) - _CLIENTS_MAX + 1)]:
+            self._clients.pop(key).close()
 
     def _client_gone(self, gid: bytes) -> None:
         for server in self._served.values():

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable
 
 _REMEMBERED_MAX = 256  # requests of a service whose answers are kept for repetitions
+_REPETITIONS_MAX = 16  # of a request that waits; of more, the oldest are dropped
+_REPLIES_MAX = 1024  # that wait for a caller which does not read; until then further requests are lost
 _KEPT_BYTES_MAX = 4096  # bytes of such an answer; a request with a longer one is served again
 _ATTACHMENT_MAX = 512  # bytes; longer ones are not read
 _ERROR_MAX = 4096  # bytes of an error's text
@@ -126,6 +128,9 @@ class RmwServer:
                 self._session.lost.guard(request.cancel)
 
     def _on_query(self, query: zenoh.Query) -> None:
+        if self._session.requests.pending_calls >= _REPLIES_MAX:
+            self._session.lost["too many calls"] += 1
+            return
         payload, header = query.payload, query.attachment
         try:
             if payload is None or not 0 < len(payload) <= SIZE_MAX:
@@ -148,6 +153,9 @@ class RmwServer:
             return
         if request is not None and not request.done:
             request.queries.append(query)
+            if len(request.queries) > _REPETITIONS_MAX:
+                self._session.lost["too many calls"] += 1
+                del request.queries[0]
             return
         request = self._requests[identity] = RmwRequest(self._session, self._key, sequence, gid)
         request.queries.append(query)
@@ -180,6 +188,12 @@ class RmwClient:
         self._gid = gid_of(encode_token(self.token))
         self._sequence = 0
         self._open: set[asyncio.Future[bytes | None]] = set()
+        self._calls = 0
+
+    @property
+    def is_idle(self) -> bool:
+        """Return whether no call waits."""
+        return not self._calls
 
     def close(self) -> None:
         """Undeclare the client; calls that wait end with an error."""
@@ -191,17 +205,24 @@ class RmwClient:
     async def call(self, request: bytes, timeout: float) -> bytes:
         """Return the response. Raises NoServer, ServiceError or TimeoutError."""
         self._sequence += 1
-        sequence = self._sequence
-        limit = None if math.isinf(timeout) else timeout
-        async with asyncio.timeout(limit):
-            for pause in (*_PAUSES, None):
-                response = await self._query(request, sequence, timeout)
-                if response is not None:
-                    return response
-                if pause is None or not self._has_server():
-                    break
-                await asyncio.sleep(pause)  # its queryable is not known here yet
-        raise NoServer(self._why_none())
+        self._calls += 1
+        try:
+            async with asyncio.timeout(None if math.isinf(timeout) else timeout):
+                response = await self._ask(request, self._sequence, timeout)
+        finally:
+            self._calls -= 1
+        if response is None:
+            raise NoServer(self._why_none())
+        return response
+
+    async def _ask(self, request: bytes, sequence: int, timeout: float) -> bytes | None:
+        """Send the request until a server answers; return None if none does."""
+        for pause in (*_PAUSES, None):
+            response = await self._query(request, sequence, timeout)
+            if response is not None or pause is None or not self._has_server():
+                return response
+            await asyncio.sleep(pause)  # its queryable is not known here yet
+        return None
 
     def _has_server(self) -> bool:
         servers = self._session.graph.endpoints(EntityKind.SERVER, self._service)

@@ -269,15 +269,20 @@ class RmwSubscription:
         publisher = self._publishers.get(gid)
         if publisher is None or publisher.graph_version != self._session.graph.version:
             publisher = self._look_up(gid, publisher)
-        if sequence != publisher.sequence + 1 and self._was_received(sequence, publisher.sequence):
+        if sequence != publisher.sequence + 1 and self._was_received(sequence, publisher.sequence, gid):
             return None
         publisher.sequence = sequence
         if sequence < 0 or stamp < 0:
             sequence, stamp = max(sequence, 0), max(stamp, 0)
         return RosArrival(self._encoded, payload.to_bytes(), publisher.node, sequence, stamp, gid)
 
-    def _was_received(self, sequence: int, last: int) -> bool:
-        """Return whether a transient local publisher's message came before; count those missed before this one."""
+    def _was_received(self, sequence: int, last: int, gid: bytes) -> bool:
+        """Return whether a transient local publisher's message came before; count those missed before this one.
+
+        Publishers whose gid is not one can't be told apart, so neither is known of them.
+        """
+        if len(gid) != GID_BYTES or not any(gid):
+            return False
         if 0 < last < sequence < last + _GAP_MAX:
             self._session.lost["on the way"] += sequence - last - 1
         return self._transient_local and 0 < sequence <= last

@@ -3,7 +3,14 @@
 import pytest
 
 from r2p.ros.ros2.graph import TOKENS_MAX, TokenGraph
-from r2p.ros.ros2.keys import data_key, dds_type, decode_attachment, encode_attachment
+from r2p.ros.ros2.keys import (
+    ATTACHMENT,
+    EntityKind,
+    data_key,
+    dds_type,
+    decode_attachment,
+    encode_attachment,
+)
 from r2p.transports.stats import LoggedCounter
 from tests.ros.ros2.network import STRING, endpoint, joined, router
 from tests.ros.ros2.recorded import SESSION, recorded
@@ -46,6 +53,32 @@ async def test_recorded_messages() -> None:
         assert {each.node for each in user.arrivals} == {""}
         assert a.lost == {"wrong attachment": 3, "undecodable": 2}
         assert unusable == 5
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("gid", [b"", bytes(16)])
+async def test_publishers_that_share_a_gid_that_is_none(gid: bytes) -> None:
+    """What a second one sends with the numbers of the first has not been received before."""
+    async with router() as network, joined(network, "/here") as (a, user):
+        a.subscribe(endpoint("/here", "/accept", transient_local=True, depth=10))
+        with network.plain_session() as session:
+            publisher = session.declare_publisher(KEY)
+            await user.until(lambda: publisher.matching_status)
+            for number in (1, 2, 3, 1, 2, 9):
+                publisher.put(b"%d" % number, attachment=ATTACHMENT.pack(number, 0, len(gid), gid)[: 17 + len(gid)])
+            await user.until(lambda: len(user.arrivals) == 6)
+        assert not a.lost
+
+
+def test_tokens_with_one_gid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """XXH3 is not made against tokens that are made up to collide."""
+    monkeypatch.setattr("r2p.ros.ros2.graph.gid_of", lambda _: bytes(16))
+    graph = TokenGraph("ab", LoggedCounter())
+    for number in (1, 2):
+        graph.add(TOKEN % number)
+    for number in (1, 2):
+        assert graph.remove(TOKEN % number) is not None
+    assert not list(graph.endpoints(EntityKind.SUBSCRIBER, "/accept"))
 
 
 @pytest.mark.anyio

@@ -142,6 +142,32 @@ async def test_repetitions() -> None:
         assert len(user_a.requests) == 2
 
 
+async def test_a_flood_of_repetitions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a request that is not answered yet the last repetitions wait; and none is taken while callers do not read."""
+    monkeypatch.setattr("r2p.ros.ros2.services._REPETITIONS_MAX", 2)
+    async with router() as network, served(network) as (a, user_a, session):
+        waiting: list[Any] = []
+        user_a.handle = lambda _, answer, __: waiting.append(answer)
+        header = encode_attachment(1, 5, GID)
+        asked = [asyncio.ensure_future(ask(session, b"a", header)) for _ in range(6)]
+        await user_a.until(lambda: a.lost["too many calls"] == 4)
+        waiting[0](b"same")
+        replies = [reply for each in asked for reply in await each]
+        assert len(replies) == 2
+        monkeypatch.setattr("r2p.ros.ros2.services._REPLIES_MAX", 0)
+        assert await ask(session, b"b", header) == []
+        assert (len(user_a.requests), a.lost) == (1, {"too many calls": 5})
+
+
+async def test_clients_that_call_no_more_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("r2p.ros.ros2.middleware._CLIENTS_MAX", 2)
+    async with router() as network, joined(network, "/caller") as (b, _):
+        for name in ("/a", "/b", "/a", "/c"):
+            with pytest.raises(r2p.NoServer):
+                await b.call("/caller", name, SET_BOOL, b"x", 5)
+        assert [service for _, service, _ in b._clients] == ["/a", "/c"]
+
+
 async def test_responses_that_are_not_for_the_caller() -> None:
     """A response needs no attachment; with another number or gid it is not the one that is waited for."""
     headers: list[bytes | None] = []
