@@ -11,6 +11,7 @@ integer nanoseconds; durations in programs are numbers of seconds, and texts suc
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import contextvars
 import functools
 import logging
@@ -26,7 +27,7 @@ from r2p.errors import MessageError
 from r2p.units import MILLISECOND, SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 logger = logging.getLogger("r2p.clock")
 
@@ -143,6 +144,22 @@ REAL_TIME: Final[contextvars.ContextVar[bool]] = contextvars.ContextVar("r2p.REA
 """True in code whose timers are for other programs, such as time-outs of connections, also under virtual time at a
 speed: there they count real time.
 """
+
+
+def real_clock() -> Clock:
+    """Return the clock that timers with REAL_TIME follow: that of the running loop, unless it has a speed."""
+    clock = clock_of()
+    return _SYSTEM if getattr(clock, "paced", False) else clock
+
+
+@contextlib.contextmanager
+def real_time() -> Iterator[None]:
+    """Let timers that are set in this block, and in tasks that it starts, count real time."""
+    outer = REAL_TIME.set(True)
+    try:
+        yield
+    finally:
+        REAL_TIME.reset(outer)
 
 
 def in_background(timer: asyncio.TimerHandle, background: bool | Callable[[], bool] = True) -> None:

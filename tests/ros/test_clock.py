@@ -2,20 +2,25 @@
 
 import asyncio
 import itertools
+from collections import Counter
 from collections.abc import Callable
 
 import pytest
 
 import r2p
 import r2p.sim
-from r2p.clock import REAL_TIME
+from r2p.clock import REAL_TIME, SteeredClock, clock_of
 from r2p.messages import Timestamp
 from r2p.ros.clock import RosClock
 from r2p.ros.middleware import MiddlewareUser
+from r2p.ros.ros1 import registration
+from r2p.ros.ros1.xmlrpc import XmlRpcServer
+from r2p.ros.ros1.xmlrpc_codec import Value
 from r2p.ros.transport import RosTransport
 from r2p.testing.network import node_in
 from r2p.units import MILLISECOND, SECOND
 from tests.ros.fake import FakeMiddleware, FakeRosNetwork
+from tests.ros.ros1.session import running
 
 both = pytest.mark.parametrize("version", [1, 2])
 SIMULATED = 100 * SECOND
@@ -81,3 +86,28 @@ async def test_connections_have_real_time_and_what_they_deliver_has_not() -> Non
     async with r2p.Module("PC1", via=transport):
         seen.append(REAL_TIME.get())
     assert seen == [True, False]
+
+
+def test_a_master_is_asked_while_the_simulator_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registration, "LOOK_S", 0.01)
+
+    async def main() -> None:
+        asked, often = Counter[str](), asyncio.Event()
+
+        def answer(method: str, _arguments: list[Value]) -> object:
+            asked[method] += 1
+            if asked["getSystemState"] >= 3:
+                often.set()
+            return [1, "", [[], [], []] if method == "getSystemState" else [] if method == "getTopicTypes" else 1]
+
+        clock = clock_of()
+        assert isinstance(clock, SteeredClock)
+        clock.follow(SIMULATED, lambda: True)  # and from now on it stands still
+        master = XmlRpcServer("127.0.0.1", answer, Counter())
+        await master.start()
+        REAL_TIME.set(True)  # as of each link to ROS
+        async with running(f"http://127.0.0.1:{master.port}"), asyncio.timeout(5.0):
+            await often.wait()
+        await master.close()
+
+    r2p.sim.run(main, follow=True)

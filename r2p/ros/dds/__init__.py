@@ -39,14 +39,14 @@ def from_url(url: Url) -> RosTransport:
     interface = parsed.get("interface", _interface_of_environment(os.environ))
     name = f"dds:?domain={number}" if number else "dds:"
 
-    def make(hub: "Hub") -> Middleware:
+    def make(_hub: "Hub") -> Middleware:
         try:
             from r2p.ros.dds.middleware import DdsMiddleware
         except ImportError as error:
             if (error.name or "").partition(".")[0] != "cyclonedds":
                 raise
             raise TransportError("dds: cyclonedds is missing: pip install 'r2p[dds]'") from error
-        return DdsMiddleware(number, interface, hub.space.clock)
+        return DdsMiddleware(number, interface)
 
     return RosTransport(name, make, options)
 

@@ -14,7 +14,7 @@ from typing import ClassVar
 import msgspec
 from cyclonedds.core import DDSException
 
-from r2p.clock import Clock
+from r2p.clock import real_clock, real_time
 from r2p.errors import ServiceError
 from r2p.ros.dds.cyclone import DdsEvents, Participant
 from r2p.ros.dds.graph import DdsEndpoint, DdsGraph, OwnNode, announce
@@ -66,10 +66,10 @@ class DdsMiddleware(Middleware):
     version = 2
     has_services: ClassVar[bool] = False
 
-    def __init__(self, domain: int, interface: str, clock: Clock) -> None:
+    def __init__(self, domain: int, interface: str) -> None:
         self.lost = Counter()
         self._place = domain, interface
-        self._clock = clock
+        self._clock = real_clock()
         self._graph = DdsGraph()
         self._nodes: list[str] = []
         self._writers: dict[tuple[str, str], _OwnWriter] = {}
@@ -204,7 +204,11 @@ class DdsMiddleware(Middleware):
             self.lost["send buffer full"] += 1
         own.held.append(payload)
         if not self._retries:
-            self._retries = True
+            self._retry_soon()
+
+    def _retry_soon(self) -> None:
+        self._retries = True
+        with real_time():
             asyncio.get_running_loop().call_later(RETRY_S, self._retry)
 
     def _retry(self) -> None:
@@ -215,8 +219,7 @@ class DdsMiddleware(Middleware):
             while own.held and participant.write(own.number, own.held[0]):
                 own.held.popleft()
         if any(own.held for own in self._writers.values()):
-            self._retries = True
-            asyncio.get_running_loop().call_later(RETRY_S, self._retry)
+            self._retry_soon()
         if was_full and not self.full:
             self._user.made_room()
 

@@ -1,7 +1,7 @@
 """TCPROS connections on asyncio: what all roles share, and the listener of a node.
 
 A node listens at one port. The header of each connection says what it is for: a subscriber's goes to the publication of
-its topic, a caller's to the server of its service. Whoever connects has HEADER_S seconds for that.
+its topic, a caller's to the server of its service. The other side has HEADER_S seconds for that.
 """
 
 import asyncio
@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Protocol, cast
 
-from r2p.clock import random_of
+from r2p.clock import random_of, real_time
 from r2p.errors import DecodeError, TransportError
 from r2p.ros.middleware import MiddlewareUser
 from r2p.ros.ros1.tcpros import Fields, FrameReader, decode_header, encode_error
@@ -261,7 +261,8 @@ class TcprosListener:
     def start(self) -> None:
         """Accept connections."""
         loop = asyncio.get_running_loop()
-        self._starting = loop.create_task(loop.create_server(self.protocol, sock=self._socket))
+        with real_time():
+            self._starting = loop.create_task(loop.create_server(self.protocol, sock=self._socket))
 
     def protocol(self) -> asyncio.Protocol:
         """Return the protocol of a new connection."""

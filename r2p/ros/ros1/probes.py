@@ -23,7 +23,7 @@ _OF_EACH_NODE = {
     "get_loggers": RosService("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0"),
     "set_logger_level": RosService("roscpp/SetLoggerLevel", "51da076440d78ca1684d36c868df61ea"),
 }
-"""The services that each node has, by the ends of their names: nobody needs to ask for these."""
+"""The services that each node has, by the ends of their names: these are not asked for."""
 
 Probe = Callable[[str], Awaitable[RosService]]
 """Asks the server of a service. Raises NoServer, ServiceError, or TimeoutError."""

@@ -10,7 +10,7 @@ publishers wait, unless it has read nothing for SLOW_S: then it is slow, and onl
 import asyncio
 from collections import deque
 
-from r2p.clock import clock_of
+from r2p.clock import real_clock, real_time
 from r2p.ros.middleware import RosEndpoint
 from r2p.ros.ros1.connections import Ros1Context, TcprosConnection, take_over
 from r2p.ros.ros1.tcpros import Fields, encode_header, frame, publisher_header, refuse_subscriber
@@ -49,7 +49,7 @@ class SubscriberConnection(TcprosConnection):
         self._unsent = 0  # bytes that the socket had not accepted when the timer was started
         self._emptied = False  # True if it has accepted all of them since
         self._loop = asyncio.get_running_loop()
-        self._monotonic = clock_of(self._loop).monotonic
+        self._monotonic = real_clock().monotonic
         self._sent_at = self._monotonic() - _GATHER  # ns
         self._many = False  # True if several messages went out at the end of the last turn with any
 
@@ -166,7 +166,8 @@ class SubscriberConnection(TcprosConnection):
 
     def _arm(self) -> None:
         self._unsent, self._emptied = self._unsent_now(), False
-        self._timer = self._loop.call_later(SLOW_S, self._check_progress)
+        with real_time():  # also of a program under virtual time
+            self._timer = self._loop.call_later(SLOW_S, self._check_progress)
 
     def _unsent_now(self) -> int:
         return self.transport.get_write_buffer_size() if self.transport is not None else 0

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final, Literal, NamedTuple
 
+from r2p.clock import real_clock
 from r2p.errors import Broken, NoServer, TransportError
 from r2p.ros.middleware import MiddlewareUser, RosGraph, RosPeerEndpoint, RosPeerServer
 from r2p.ros.ros1.environment import RosAddress, reachable_host, uri_of
@@ -18,6 +19,7 @@ from r2p.ros.ros1.master import MasterClient, MasterError, SystemState, value_of
 from r2p.ros.ros1.slave import SlaveNode, SlaveUser
 from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError, XmlRpcServer, split_uri
 from r2p.ros.ros1.xmlrpc_codec import Value
+from r2p.units import SECOND
 
 LOOK_S: Final = 1.0
 """Seconds between two looks at what is registered."""
@@ -344,7 +346,7 @@ class MasterSession:
             del self._registered[each]
         self._touch()
 
-    # What the slaves are told by others
+    # What others ask of the slaves
 
     def publishers_updated(self, node: str, topic: str, publishers: list[str]) -> None:
         """Note all publishers of a topic."""
@@ -400,7 +402,7 @@ class MasterSession:
             self.remove_node(node)
             self._user.shut_down(node, reason)
 
-    # What users are told
+    # Notices for users
 
     def _note_up(self) -> None:
         if self._user is None:
@@ -468,7 +470,7 @@ class MasterSession:
 
 
 def _now() -> float:
-    return asyncio.get_running_loop().time()
+    return real_clock().monotonic() / SECOND
 
 
 def _contains(subscribed: str, key: str) -> bool:

@@ -7,12 +7,13 @@ import asyncio
 import socket
 from collections.abc import Iterable
 
-from r2p.clock import Backoff
+from r2p.clock import Backoff, real_clock, real_time
 from r2p.ros.middleware import RosArrival, RosEndpoint, RosType
 from r2p.ros.ros1.connections import Ros1Context, TcprosConnection
 from r2p.ros.ros1.slave import request_topic
 from r2p.ros.ros1.tcpros import ANY, MESSAGE_MAX, Fields, encode_header, refuse_publisher, subscriber_header
 from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError
+from r2p.units import SECOND
 
 CONNECT_S = 5.0
 """Seconds for a publisher to answer a request, or to accept a connection."""
@@ -163,8 +164,9 @@ class Ros1Subscription:
         wanted = set(publishers)
         for uri in self._tasks.keys() - wanted:
             self._drop(uri)
-        for uri in wanted - self._tasks.keys():
-            self._tasks[uri] = asyncio.get_running_loop().create_task(self._follow(uri))
+        with real_time():
+            for uri in wanted - self._tasks.keys():
+                self._tasks[uri] = asyncio.get_running_loop().create_task(self._follow(uri))
 
     def opened(self, connection: PublisherConnection, fields: Fields) -> None:
         """Note that messages come on a connection from now on."""
@@ -199,8 +201,8 @@ class Ros1Subscription:
 
     async def _follow(self, uri: str) -> None:
         """Connect to a publisher, again and again, until cancelled."""
-        now = asyncio.get_running_loop().time
         backoff = Backoff(self.context.random, longest=RETRY_S)
+        now = real_clock().monotonic
         worked_at = now()
         while True:
             began = now()
@@ -208,11 +210,11 @@ class Ros1Subscription:
                 await self._receive_from(uri)
                 worked_at = now()
             except (OSError, XmlRpcError) as error:
-                if now() - worked_at >= REPORT_S or isinstance(error, socket.gaierror):
+                if now() - worked_at >= REPORT_S * SECOND or isinstance(error, socket.gaierror):
                     self._report(uri, error)
             except Exception as error:  # noqa: BLE001 - counted and logged; the next attempt follows
                 self.context.internal_error(error)
-            if now() - began >= _STABLE_S:
+            if now() - began >= _STABLE_S * SECOND:
                 backoff.reset()
             await asyncio.sleep(backoff.delay())
 

@@ -42,7 +42,7 @@ def domain() -> int:
 
 @contextlib.asynccontextmanager
 async def participant(domain: int) -> AsyncGenerator[tuple[DdsMiddleware, Recorder], None]:
-    middleware, user, opened = DdsMiddleware(domain, "lo", SystemClock()), Recorder(), asyncio.Event()
+    middleware, user, opened = DdsMiddleware(domain, "lo"), Recorder(), asyncio.Event()
     running = asyncio.create_task(middleware.run(user, opened.set))
     try:
         await asyncio.wait([running, asyncio.create_task(opened.wait())], return_when=asyncio.FIRST_COMPLETED)
