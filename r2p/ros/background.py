@@ -15,6 +15,7 @@ from r2p.errors import MessageError
 T = TypeVar("T")
 
 _RESULTS_MAX = 16_384
+_WAITING_MAX = 4096
 
 
 class BackgroundResults:
@@ -61,6 +62,8 @@ class BackgroundResults:
         if key in self._waiting:
             self._waiting[key][topic] = None
             return
+        if len(self._waiting) >= _WAITING_MAX:
+            return  # a node that changes its types all the time: the next change of the topic begins anew
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, thread_name_prefix="r2p-ros")
         self._waiting[key] = {topic: None}

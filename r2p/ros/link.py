@@ -17,6 +17,7 @@ import msgspec
 from r2p.clock import REAL_TIME
 from r2p.codecs.management import ANY_TYPE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError, MessageError
+from r2p.log_lines import LineLimit
 from r2p.messages import SIZE_MAX, Message, layout
 from r2p.names import LOG, SERVICE_SUFFIXES
 from r2p.protocols.discovery.directory import TABLE_MAX
@@ -51,6 +52,7 @@ from r2p.transports.stats import LoggedCounter
 
 _GATEWAYS_KEY = GATEWAYS.encode()
 _NOTHING = TopicType(), TopicType()
+_NOTICE_MAX = 2000  # characters of a notice, which may be another program's text
 _ROLES = (ROLE_PUBLISHES, ROLE_SUBSCRIBES)
 
 
@@ -103,6 +105,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._latched: set[str] = set()
         """Topics that a ROS node latches."""
         self._sources: dict[str, Source] = {}
+        self._notices: set[str] = set()
+        self._notice_limit = LineLimit()
         self._received_at = 0  # UTC in ns, of the last messages
         self._gateways = GatewayExchange(middleware, self._registrations, hub.space.clock)
 
@@ -446,8 +450,10 @@ class RosLink(BufferedLink, MiddlewareUser):
     def received(self, messages: list[RosArrival]) -> None:
         self._received_at = self._clock.now()
         middleware_time = REAL_TIME.set(False)  # what subscribers begin is of this program
-        self.receive(messages)
-        REAL_TIME.reset(middleware_time)
+        try:
+            self.receive(messages)
+        finally:
+            REAL_TIME.reset(middleware_time)
 
     @property
     def registrations(self) -> Registrations:
@@ -457,12 +463,17 @@ class RosLink(BufferedLink, MiddlewareUser):
     def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
         handle = self.own_servers.get(service) or functools.partial(self.services.requested, service)
         middleware_time = REAL_TIME.set(False)  # as above, for its handler
-        cancel = handle(request, answer, refuse)
-        REAL_TIME.reset(middleware_time)
-        return cancel
+        try:
+            return handle(request, answer, refuse)
+        finally:
+            REAL_TIME.reset(middleware_time)
 
     def notice(self, kind: str, text: str, *, trouble: bool) -> None:
-        self._hub.link_notice(self, kind, text, trouble=trouble)
+        known = kind if kind in self._notices or len(self._notices) < TABLE_MAX else ""
+        self._notices.add(known)
+        suffix = self._notice_limit.suffix(known, self._clock.monotonic())
+        if suffix is not None:
+            self._hub.link_notice(self, kind, text[:_NOTICE_MAX] + suffix, trouble=trouble)
 
     def shut_down(self, node: str, reason: str) -> None:
         self._registrations.forget_node(node)

@@ -13,6 +13,8 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import msgspec
+
 from r2p.clock import SteeredClock
 from r2p.codecs.parameters import Name, Plain
 from r2p.errors import DecodeError, Error, ParameterError
@@ -39,6 +41,9 @@ _CONSTANT = {
 _REAL_TIME = "this program has real time: one that calls r2p.sim.run(main, follow=True) has that of /clock"
 _NAMES_SHOWN = 8  # in an error
 _RUNNING_MAX = 64  # requests of ROS nodes that are worked on at once
+_REQUEST_MAX = 1 << 20  # bytes of a request
+_NAMES_MAX = 2000  # names in a request; each of them may make an answer of hundreds of bytes
+_NAME_MAX = 300  # characters of a name for which a similar one is looked for
 
 Place = tuple[str, Name]
 """A parameter of r2p: its module, and the names of its node and itself."""
@@ -169,7 +174,7 @@ class RosParameters:
     def _requested(self, node: str, name: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
         service = messages.service(name)
         try:
-            content: Any = service.request.decode(request)
+            content: Any = _decode(service, request)
         except DecodeError as error:
             self._link.stats.lost["undecodable"] += 1
             refuse(f"the request can't be read: {error}")
@@ -266,10 +271,12 @@ class RosParameters:
         info = self._nodes.get(node, {}).get(name)
         if info is None:
             own = [each for each in self._nodes.get(node, {}) if each not in _CONSTANT]
-            close = difflib.get_close_matches(name, own, n=1)
+            close = difflib.get_close_matches(name, own, n=1) if len(name) <= _NAME_MAX else []
             more = ", ..." if len(own) > _NAMES_SHOWN else ""
             known = f"it has {', '.join(own[:_NAMES_SHOWN])}{more}" if own else "it has none of its own"
-            raise ParameterError(f"{node} has no parameter {name!r}; {f'did you mean {close[0]}?' if close else known}")
+            raise ParameterError(
+                f"{node} has no parameter {name[:_NAME_MAX]!r}; {f'did you mean {close[0]}?' if close else known}"
+            )
         return info
 
     def _check_constant(self, info: ParameterInfo, value: Plain) -> None:
@@ -281,6 +288,17 @@ class RosParameters:
         if value:
             raise ParameterError(_REAL_TIME)
         raise ParameterError("this program follows /clock, from its start to its end")
+
+
+def _decode(service: messages.ParameterService, request: bytes) -> Any:
+    """Return the content of a request. Raises DecodeError also for one that would keep this program busy for long."""
+    if len(request) > _REQUEST_MAX:
+        raise DecodeError(f"it has {len(request)} bytes, more than {_REQUEST_MAX}")
+    content = service.request.decode(request)
+    count = max(len(value) for value in msgspec.structs.astuple(content) if isinstance(value, tuple))
+    if count > _NAMES_MAX:
+        raise DecodeError(f"it has {count} names, more than {_NAMES_MAX}: ask for some at a time")
+    return content
 
 
 def _describer(node: str) -> RosServer:

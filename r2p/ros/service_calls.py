@@ -28,6 +28,9 @@ from r2p.units import MILLISECOND, SECOND
 OPEN_MAX = 1024
 """Calls of one link that wait for their answer, in each direction; one more is refused as busy."""
 
+OPEN_OF_SERVICE_MAX = 512
+"""The same of ROS nodes to one service, so that one which does not answer leaves room for the others."""
+
 UNKNOWN_LIFETIME = 10 * SECOND
 """Ns: the time-out of a caller whose link does not carry it."""
 
@@ -214,9 +217,9 @@ class RosRequests:
         server: ServiceServer[Any, Any] | None = None,
     ) -> Cancel:
         """Send a request to the server, or hand it to this one of this module; return the function that cancels it."""
-        if len(self._open) >= OPEN_MAX:
+        if len(self._open) >= OPEN_OF_SERVICE_MAX and (waiting := self._waiting_too_many(service.name)):
             self._lost[_TOO_MANY] += 1
-            refuse(f"{OPEN_MAX} requests wait for their answers: call again later")
+            refuse(f"{waiting} requests wait for their answers: call again later")
             return _nothing_to_cancel
         try:
             body = service.codec.request_from_ros(request)
@@ -231,6 +234,13 @@ class RosRequests:
         else:
             self._submit(made, server)
         return lambda: self._cancel(made)
+
+    def _waiting_too_many(self, name: str) -> int:
+        """Return how many requests wait, if that is too many for one more to this service; else 0."""
+        if len(self._open) >= OPEN_MAX:
+            return OPEN_MAX
+        own = sum(each == name for each, _ in self._open)
+        return own if own >= OPEN_OF_SERVICE_MAX else 0
 
     def _submit(self, request: _OpenRequest, server: ServiceServer[Any, Any]) -> None:
         """Hand a request to a server of this module: the text of an error arrives whole, however short answers are."""

@@ -17,11 +17,14 @@ from r2p.protocols.discovery.events import TopicType
 from r2p.ros.action_types import with_names
 from r2p.ros.background import BackgroundResults
 from r2p.ros.classes import standard_classes
+from r2p.ros.definitions import TEXT_MAX
 from r2p.ros.middleware import RosPeerEndpoint
 from r2p.ros.topics import TopicTypes, ros_class, ros_type
 from r2p.transports.link import Hub
 
 _TRIES = 12
+
+_DEFINITIONS_MAX = 32 << 20  # characters of definitions that are kept; those of all types of a robot are a million
 
 _TRY_AGAIN_S = 5.0
 """Seconds after which modules are asked once more for a type that none of them gave."""
@@ -52,6 +55,8 @@ class TopicClasses:
         self._learnt: dict[tuple[str, bytes], type[Message]] = {}
         self._definitions: dict[tuple[str, str], str] = {}
         """Definitions of ROS nodes, by name and checksum of their types."""
+        self._definitions_size = 0
+        """Characters that were added to them since they were empty."""
         self._tasks: dict[object, asyncio.Task[None]] = {}
 
     def close(self) -> None:
@@ -88,9 +93,11 @@ class TopicClasses:
 
     def add_definition(self, type_name: str, checksum: str, definition: str) -> None:
         """Enter the definition of a ROS node's type."""
-        if definition:
-            if len(self._definitions) >= TABLE_MAX:
+        if 0 < len(definition) <= TEXT_MAX:
+            self._definitions_size += len(definition)
+            if len(self._definitions) >= TABLE_MAX or self._definitions_size > _DEFINITIONS_MAX:
                 self._definitions.clear()
+                self._definitions_size = len(definition)
             self._definitions[type_name, checksum] = self._definitions[type_name, ""] = definition
 
     def _remember(self, topic: str, cls: type[Message]) -> None:
@@ -140,7 +147,7 @@ class TopicClasses:
     def _of_peer(self, topic: str, peer: RosPeerEndpoint) -> type[Message] | None:
         given = self._definitions.get((peer.type, peer.checksum), "")
         try:
-            key = peer.type, peer.checksum, given
+            key = peer.type, peer.checksum, hash(given)  # the text itself may be long
             found = self._background.get(topic, key, lambda: self._make(peer.type, peer.checksum, given))
         except MessageError:
             if not given:

@@ -1,6 +1,7 @@
 """Results that a thread computes."""
 
 import asyncio
+import functools
 import threading
 
 import pytest
@@ -52,4 +53,23 @@ async def test_a_thread_computes_once_for_all_topics() -> None:
 async def test_under_virtual_time_all_is_there_at_once() -> None:
     results = BackgroundResults(asyncio.get_running_loop(), lambda _: None)
     assert results.get("a", 1, threading.current_thread) is threading.current_thread()
+    results.close()
+
+
+@pytest.mark.anyio
+async def test_a_flood_of_results_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("r2p.ros.background._WAITING_MAX", 2)
+    go, computed, done = threading.Event(), list[int](), asyncio.Event()
+    results = BackgroundResults(asyncio.get_running_loop(), lambda topic: done.set() if topic == "last" else None)
+
+    def compute(number: int) -> int:
+        go.wait()
+        computed.append(number)
+        return number
+
+    for number in range(5):
+        results.get("last" if number == 1 else "x", number, functools.partial(compute, number))
+    go.set()
+    await asyncio.wait_for(done.wait(), 60)
+    assert computed == [0, 1]
     results.close()

@@ -293,6 +293,23 @@ def test_the_name_of_a_topic_comes_back(topic: str, ns: str) -> None:
     assert there is None or names.from_ros(there) == topic
 
 
+@pytest.mark.virtual_time
+async def test_a_flood_of_notices_of_other_programs_is_short(caplog: pytest.LogCaptureFixture) -> None:
+    async with r2p.Module("PC1", via=FakeRosNetwork(1).transport()) as module:
+        link: Any = module.links[0]
+        await asyncio.sleep(0.1)
+        caplog.clear()
+        for number in range(10_000):
+            link.notice(f"connection refused: {number % 2}", "\x1b[2J" + "x" * 5000, trouble=True)
+        link.notice("other", "still heard", trouble=True)
+        await asyncio.sleep(1)
+        link.notice("connection refused: 0", "refused", trouble=True)
+    texts = [record.getMessage() for record in caplog.records if "link ros1:" in record.getMessage()]
+    assert len(texts) == 22
+    assert max(map(len, texts)) < 3000
+    assert texts[-2:] == ["link ros1: still heard", "link ros1: refused (4990 more since the last such line)"]
+
+
 HOSTILE = ["", "/", "//", "/a b", "/\x00", "/é", "/a/" + "b" * 300, "no_slash", "/~private", "/R2P", "/x" * 200, "/1"]
 
 

@@ -282,6 +282,27 @@ async def test_parameters_behind_a_gateway(ros_nodes: bool) -> None:
         assert (await tool.call("get_parameters", names=(gain,))).values[0].double_value == 0.5
 
 
+@pytest.mark.virtual_time
+async def test_requests_that_would_keep_a_node_busy_are_refused() -> None:
+    """Many names, each of which is looked at or answered; many bytes; and a name of which a similar one is sought."""
+    async with recorded_node(allow_control=True) as tool:
+        for name, field, value in (
+            ("list_parameters", "prefixes", "g"),
+            ("get_parameters", "names", "flag"),
+            ("describe_parameters", "names", "flag"),
+            ("set_parameters", "parameters", parameter_class("Parameter")(name="x")),
+        ):
+            with pytest.raises(r2p.ServiceError, match="it has 3000 names, more than 2000"):
+                await tool.call(name, **{field: (value,) * 3000})
+        with pytest.raises(r2p.ServiceError, match="more than 1048576"):
+            await tool.call("get_parameters", names=("x" * (1 << 20),))
+        ((successful, reason),) = await tool.set(**{"x" * 500_000: ros_value(type=1)})
+        assert (successful, len(reason) < 1000) == (False, True)
+        for value in (ros_value(type=77), ros_value(type=3, double_value=float("nan"))):
+            ((successful, reason),) = await tool.set(gain=value)
+            assert (successful, bool(reason)) == (False, True)
+
+
 @given(st.binary(max_size=60), st.sampled_from(sorted(messages.SERVICE_NAMES)))
 def test_requests_of_any_bytes_never_raise_anything_else(data: bytes, name: str) -> None:
     codec = messages.service(name).request

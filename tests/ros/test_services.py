@@ -323,12 +323,21 @@ async def test_a_flood_of_calls_is_refused_and_counted() -> None:
         return Trigger.Response()
 
     async with r2p.Module("PC1", via=network.transport()) as module, node_in(module) as node:
-        node.serve("slow", Trigger, slow, limit=2000)
+        for name in ("slow", "other", "third"):
+            node.serve(name, Trigger, slow, limit=2000)
         await asyncio.sleep(0.1)
-        calls = [asyncio.create_task(peer.call("/slow", Trigger.Request())) for _ in range(1100)]
-        errors = [each for each in await asyncio.gather(*calls, return_exceptions=True) if isinstance(each, Exception)]
-        assert {str(each) for each in errors} == {"1024 requests wait for their answers: call again later"}
-        assert len(errors) == module.links[0].losses["too many calls"] == 76
+        calls = [
+            asyncio.create_task(peer.call(name, Trigger.Request()))
+            for name, count in (("/slow", 520), ("/other", 500), ("/third", 15))
+            for _ in range(count)
+        ]
+        errors = [
+            str(each) for each in await asyncio.gather(*calls, return_exceptions=True) if isinstance(each, Exception)
+        ]
+        # One service leaves room for others, and all of them have a limit.
+        assert errors[:8] == ["512 requests wait for their answers: call again later"] * 8
+        assert errors[8:] == ["1024 requests wait for their answers: call again later"] * 3
+        assert module.links[0].losses["too many calls"] == 11
 
 
 @both

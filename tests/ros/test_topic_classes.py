@@ -88,3 +88,16 @@ async def test_firmware_names_no_types_so_no_type_of_the_same_size_is_taken() ->
     peers = [RosPeerEndpoint("/a", "/x", "std_msgs/Float32")]
     assert asked.classes.find("x", (NOTHING, TopicType(4)), peers) is None
     assert asked.modules == []
+
+
+@pytest.mark.virtual_time
+async def test_definitions_have_a_limit_in_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not only their number: each may have a million characters."""
+    monkeypatch.setattr("r2p.ros.topic_classes._DEFINITIONS_MAX", 1000)
+    classes = Asked([], {}).classes
+    for number in range(100):
+        classes.add_definition(f"my_msgs/T{number}", "", "float32 speed" + " " * 400)
+    assert 0 < len(classes._definitions) < 3
+    classes.add_definition("my_msgs/Long", "", "float32 speed" + " " * (1 << 20))
+    assert ("my_msgs/Long", "") not in classes._definitions
+    classes.close()
