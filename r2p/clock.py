@@ -168,6 +168,23 @@ def in_background(timer: asyncio.TimerHandle, background: bool | Callable[[], bo
         timer.background = background
 
 
+async def sleep_in_background(seconds: float) -> None:
+    """Sleep; under virtual time this keeps no program going."""
+    loop = asyncio.get_running_loop()
+    over = loop.create_future()
+    timer = loop.call_later(seconds, _finish, over)
+    in_background(timer)
+    try:
+        await over
+    finally:
+        timer.cancel()
+
+
+def _finish(future: asyncio.Future[None]) -> None:
+    if not future.done():  # it was cancelled at the same instant
+        future.set_result(None)
+
+
 class Alarm:
     """One timer that can be moved: calls `callback()` in the loop when the deadline is reached, never before.
 

@@ -78,9 +78,9 @@ class RosDiscovery(DiscoveryProtocol):
         self._is_taken = is_taken
         self._named: dict[str, tuple[str, str]] = {}
         """The names of module and node of each ROS node."""
-        self._gateways: set[str] = set()
         self.hears_gateways = False
         """True on a link that takes part in what gateways say to each other."""
+        self._gateways: set[str] = set()
         """The ROS nodes that are r2p modules with several links."""
         self._instances: dict[str, int] = {}
         """Their instances, as far as known."""

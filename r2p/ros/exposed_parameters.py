@@ -8,7 +8,7 @@ import contextlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, cast
 
-from r2p.clock import in_background
+from r2p.clock import sleep_in_background
 from r2p.codecs.own_services import WIRE_MIN
 from r2p.codecs.parameters import Name
 from r2p.errors import Error, ParameterError
@@ -48,7 +48,7 @@ class ExposedParameters:
         try:
             while True:
                 self._follow({self.own_module, *(each.name for each in self._behind())})
-                await _pause(MODULES_PERIOD_S)
+                await sleep_in_background(MODULES_PERIOD_S)
         finally:
             tasks = [*self._tasks.values()]
             for task in tasks:
@@ -90,9 +90,9 @@ class ExposedParameters:
         period = _OWN_PERIOD_S if module == self.own_module else _REMOTE_PERIOD_S
         while True:
             with contextlib.suppress(Error, TimeoutError):  # it is gone, or an older one without parameters
-                async for known in self._network.follow_parameters(module, period=period, pause=_pause):
+                async for known in self._network.follow_parameters(module, period=period, pause=sleep_in_background):
                     self._update(module, known)
-            await _pause(_RETRY_S)
+            await sleep_in_background(_RETRY_S)
 
     def _update(self, module: str, known: dict[Name, ParameterInfo]) -> None:
         if known != self.modules.get(module, {}):
@@ -100,14 +100,3 @@ class ExposedParameters:
             self._changed(module)
         if not known:
             self.modules.pop(module, None)
-
-
-async def _pause(seconds: float) -> None:
-    """Sleep. Under virtual time this keeps no program going."""
-    ended = asyncio.Event()
-    timer = asyncio.get_running_loop().call_later(seconds, ended.set)
-    in_background(timer)
-    try:
-        await ended.wait()
-    finally:
-        timer.cancel()

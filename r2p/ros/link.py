@@ -90,10 +90,10 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._background = BackgroundResults(hub.space.loop, self._touch)
         self._classes = TopicClasses(hub, self._types, self._background, self._describe, self._touch)
         module_node = self.names.own_node(hub.space.module, hub.space.module)
-        self._registrations = Registrations(
+        self.registrations = Registrations(
             middleware, module_node, hub.space.loop, lambda: self._touch(LOG), at_once=hub.observer
         )
-        self.services = RosServices(self, hub, self._ros, self._registrations)
+        self.services = RosServices(self, hub, self._ros, self.registrations)
         self.own_servers: dict[str, Callable[[bytes, Answer, Refuse], Cancel]] = {}
         """What handles requests for services that ROS's nodes have and r2p's have not, by their names in ROS."""
         self._published: dict[str, _Published] = {}
@@ -108,7 +108,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._notices: set[str] = set()
         self._notice_limit = LineLimit()
         self._received_at = 0  # UTC in ns, of the last messages
-        self._gateways = GatewayExchange(middleware, self._registrations, hub.space.clock)
+        self._gateways = GatewayExchange(middleware, self.registrations, hub.space.clock)
 
     # Own topics
 
@@ -123,7 +123,7 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def _review_safely(self, topic: str) -> None:
         self.stats.lost.guard(self._review, topic)
-        if topic != LOG and self._log_node() != self._registrations.node_of(LOG):
+        if topic != LOG and self._log_node() != self.registrations.node_of(LOG):
             self._ros.touch(LOG)
 
     def _review(self, topic: str) -> None:
@@ -223,7 +223,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         self._published.pop(topic, None)
         self._subscribed.pop(topic, None)
         for role in _ROLES:
-            self._registrations.declare(topic, role, set())
+            self.registrations.declare(topic, role, set())
         if (name := self.names.to_ros(topic)) is not None and self._by_ros_name.pop(name, None) is not None:
             self._found.pop(topic, None)
             self._latched.discard(topic)
@@ -233,20 +233,20 @@ class RosLink(BufferedLink, MiddlewareUser):
     def _publish(self, topic: str, name: str, travel: RosTopic | None) -> None:
         if travel is None:
             self._published.pop(topic, None)
-            self._registrations.declare(topic, ROLE_PUBLISHES, set())
+            self.registrations.declare(topic, ROLE_PUBLISHES, set())
             return
         nodes = self._nodes(topic, ROLE_PUBLISHES)
         shown = sorted(set(nodes.values()))
-        default = shown[0] if len(shown) == 1 else self._registrations.module_node
-        if topic == LOG and default == self._registrations.module_node and not self._registrations.shows_module_node:
-            self._registrations.declare(topic, ROLE_PUBLISHES, set())  # until one of its nodes is shown, or itself is
+        default = shown[0] if len(shown) == 1 else self.registrations.module_node
+        if topic == LOG and default == self.registrations.module_node and not self.registrations.shows_module_node:
+            self.registrations.declare(topic, ROLE_PUBLISHES, set())  # until one of its nodes is shown, or itself is
             self._apply(self._ros.set_subscribed(topic, subscribed=False))
             return
         self._published[topic] = _Published(name, travel.encode, default, nodes)
         latched = self._ros.publishes_latched(topic)
         qos = publisher_qos(self._space.topics.get(topic), latched=latched, change=lookup(self.options.qos, topic))
         endpoints = {RosEndpoint(node, name, travel.type, qos) for node in shown or [default]}
-        self._registrations.declare(topic, ROLE_PUBLISHES, endpoints)
+        self.registrations.declare(topic, ROLE_PUBLISHES, endpoints)
         # The middleware keeps the values for later subscribers, so it has to get each; but logs would load each bus.
         if qos.transient_local and topic != LOG:
             self._apply(self._ros.set_subscribed(topic, subscribed=True))
@@ -255,13 +255,13 @@ class RosLink(BufferedLink, MiddlewareUser):
         if travel is None:
             self._subscribed.pop(topic, None)
             self._found.pop(topic, None)
-            self._registrations.declare(topic, ROLE_SUBSCRIBES, set())
+            self.registrations.declare(topic, ROLE_SUBSCRIBES, set())
             return
         self._subscribed[topic] = travel
-        shown = set(self._nodes(topic, ROLE_SUBSCRIBES).values()) or {self._registrations.module_node}
+        shown = set(self._nodes(topic, ROLE_SUBSCRIBES).values()) or {self.registrations.module_node}
         publishers = self._ros.peers.get((topic, ROLE_PUBLISHES), [])
         qos = subscriber_qos(self._space.topics.get(topic), publishers, lookup(self.options.qos, topic))
-        self._registrations.declare(
+        self.registrations.declare(
             topic, ROLE_SUBSCRIBES, {RosEndpoint(node, name, travel.type, qos) for node in shown}
         )
 
@@ -279,8 +279,8 @@ class RosLink(BufferedLink, MiddlewareUser):
     def _log_node(self) -> str:
         """Return the ROS node that publishes the log, which is that of all nodes of the module."""
         if self._ros.is_gateway:
-            return self._registrations.module_node
-        return next(iter(self._registrations.nodes_besides(LOG)), self._registrations.module_node)
+            return self.registrations.module_node
+        return next(iter(self.registrations.nodes_besides(LOG)), self.registrations.module_node)
 
     # What is reported
 
@@ -294,9 +294,9 @@ class RosLink(BufferedLink, MiddlewareUser):
     async def _describe(self, peer: RosPeerEndpoint) -> str:
         """Return the definition of another node's type: of the middleware, else of the node itself."""
         found, middleware = await self.middleware.describe(peer), self.middleware
-        if found or middleware.version == 1 or not middleware.has_services or not self._registrations.nodes:
+        if found or middleware.version == 1 or not middleware.has_services or not self.registrations.nodes:
             return found
-        return await type_descriptions.ask(middleware, min(self._registrations.nodes), peer)
+        return await type_descriptions.ask(middleware, min(self.registrations.nodes), peer)
 
     def known_types(self) -> Iterable[type[Message]]:
         return self._classes.known
@@ -391,7 +391,7 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def close(self) -> None:
         self._not_on_ros.close()
-        self._registrations.close()
+        self.registrations.close()
         self.services.close()
         self._classes.close()
         self._background.close()
@@ -455,11 +455,6 @@ class RosLink(BufferedLink, MiddlewareUser):
         finally:
             REAL_TIME.reset(middleware_time)
 
-    @property
-    def registrations(self) -> Registrations:
-        """Return the ROS nodes of this link, and what they have."""
-        return self._registrations
-
     def requested(self, service: str, caller: str, request: bytes, answer: Answer, refuse: Refuse) -> Cancel:
         handle = self.own_servers.get(service) or functools.partial(self.services.requested, service)
         middleware_time = REAL_TIME.set(False)  # as above, for its handler
@@ -476,7 +471,7 @@ class RosLink(BufferedLink, MiddlewareUser):
             self._hub.link_notice(self, kind, text[:_NOTICE_MAX] + suffix, trouble=trouble)
 
     def shut_down(self, node: str, reason: str) -> None:
-        self._registrations.forget_node(node)
+        self.registrations.forget_node(node)
         self.notice("ROS node ended", f"{node} is no longer a ROS node here: {reason}", trouble=True)
 
 

@@ -121,6 +121,10 @@ Cancel = Callable[[], None]
 """Cancels a request whose caller is gone; does nothing once it is answered."""
 
 
+def nothing_to_cancel() -> None:
+    """Do nothing: the `Cancel` of a request that is answered already, or can't be stopped."""
+
+
 class MiddlewareUser(Protocol):
     """The link, as its middleware sees it. All is called in the event loop, and never raises."""
 

@@ -24,7 +24,7 @@ from r2p.ros import parameter_messages as messages
 from r2p.ros import type_descriptions
 from r2p.ros.exposed_parameters import ExposedParameters
 from r2p.ros.link import RosLink
-from r2p.ros.middleware import Answer, Cancel, Qos, Refuse, RosEndpoint, RosServer
+from r2p.ros.middleware import Answer, Cancel, Qos, Refuse, RosEndpoint, RosServer, nothing_to_cancel
 from r2p.ros.registrations import CALLS, RosClient
 from r2p.ros.transport import RosTransport
 from r2p.transports.link import Hub
@@ -71,7 +71,7 @@ class RosParameters:
             self._link.registrations.watch(self._node_shown, self._node_gone)
             await self._exposed.run()
         finally:
-            self._link.registrations.watch(_ignore, _ignore)
+            self._link.registrations.unwatch()
             for task in list(self._running):
                 task.cancel()
 
@@ -178,7 +178,7 @@ class RosParameters:
         except DecodeError as error:
             self._link.stats.lost["undecodable"] += 1
             refuse(f"the request can't be read: {error}")
-            return _nothing_to_cancel
+            return nothing_to_cancel
         handler = getattr(self, f"_{name}")
         if not name.startswith("set_"):
             answer(service.response.encode(service.response_class(*handler(node, content))))
@@ -188,7 +188,7 @@ class RosParameters:
             task = asyncio.get_running_loop().create_task(self._answer(service, handler(node, content), answer))
             self._running.add(task)
             task.add_done_callback(self._running.discard)
-        return _nothing_to_cancel  # what is being set can't be stopped half-way
+        return nothing_to_cancel  # what is being set can't be stopped half-way
 
     async def _answer(self, service: messages.ParameterService, made: Any, answer: Answer) -> None:
         answer(service.response.encode(service.response_class(await made)))
@@ -203,7 +203,7 @@ class RosParameters:
         except DecodeError as error:
             self._link.stats.lost["undecodable"] += 1
             refuse(f"the request can't be read: {error}")
-        return _nothing_to_cancel
+        return nothing_to_cancel
 
     def _find(self, node: str, names: tuple[str, ...]) -> list[ParameterInfo]:
         """Return the parameters; as in ROS, none at all if there is not one of them."""
@@ -303,12 +303,6 @@ def _decode(service: messages.ParameterService, request: bytes) -> Any:
 
 def _describer(node: str) -> RosServer:
     return RosServer(node, f"{node}/{type_descriptions.NAME}", type_descriptions.service())
-
-
-def _nothing_to_cancel() -> None: ...
-
-
-def _ignore(node: str) -> None: ...
 
 
 def _report(link: RosLink, task: "asyncio.Task[None]") -> None:

@@ -102,6 +102,10 @@ class Registrations:
         for node in sorted(self.nodes):
             shown(node)
 
+    def unwatch(self) -> None:
+        """Call these functions no more."""
+        self._shown = self._gone = _do_nothing
+
     @property
     def shows_module_node(self) -> bool:
         """Return whether the module itself is a ROS node."""

@@ -18,7 +18,7 @@ from r2p.clock import Alarm, Clock
 from r2p.codecs import services
 from r2p.codecs.services import HEADER_SIZE, NUMBERS, REQUESTS, RESPONSES, TEXT_MIN, Kind, ServiceHeader
 from r2p.errors import DecodeError, Error, MessageError
-from r2p.ros.middleware import Answer, Cancel, Middleware, Refuse
+from r2p.ros.middleware import Answer, Cancel, Middleware, Refuse, nothing_to_cancel
 from r2p.ros.service_types import RosServiceCodec
 from r2p.services.answers import RememberedAnswers
 from r2p.services.server import Handling, ServiceServer
@@ -220,13 +220,13 @@ class RosRequests:
         if len(self._open) >= OPEN_OF_SERVICE_MAX and (waiting := self._waiting_too_many(service.name)):
             self._lost[_TOO_MANY] += 1
             refuse(f"{waiting} requests wait for their answers: call again later")
-            return _nothing_to_cancel
+            return nothing_to_cancel
         try:
             body = service.codec.request_from_ros(request)
         except (DecodeError, MessageError) as error:
             self._lost["undecodable"] += 1
             refuse(str(error))
-            return _nothing_to_cancel
+            return nothing_to_cancel
         number = self._next_number(service.name)
         made = self._open[service.name, number] = _OpenRequest(service, number, body, answer, refuse)
         if server is None:
@@ -334,6 +334,3 @@ class RosRequests:
 
     def _set_alarm(self) -> None:
         self._alarm.set(min((each.repeat_at for each in self._open.values() if each.repeat_at), default=None))
-
-
-def _nothing_to_cancel() -> None: ...

@@ -34,6 +34,7 @@ from r2p.ros.middleware import (
     RosPeerEndpoint,
     RosPeerServer,
     RosServer,
+    nothing_to_cancel,
 )
 from r2p.ros.options import RosOptions, lookup
 from r2p.ros.registrations import CALLS, SERVES, TYPE_UNKNOWN, NotOnRos, Registrations, RosClient
@@ -48,8 +49,6 @@ from r2p.units import MILLISECOND
 
 _OF_EACH_NODE = frozenset({"rcl_interfaces", "type_description_interfaces", "roscpp"})
 """Packages of the services that each node has."""
-_OF_EACH_NODE_OF_ROS1 = ("/get_loggers", "/set_logger_level")
-"""How these services end where types are not known."""
 
 _NOTICES_MAX = 256
 """Different notices of one link; further ones are left out."""
@@ -317,7 +316,7 @@ class RosServices:
         service = self._by_ros_name.get(ros_name)
         if service is None or not service.serves:
             refuse(f"{ros_name} is not served here any more")
-            return _nothing_to_cancel
+            return nothing_to_cancel
         topic = self._space.topics.get(service.name + REQUESTS)
         server = None if topic is None else server_of(topic.queues)
         if server is None:
@@ -367,13 +366,8 @@ def _codec_of(requests: Layout[Any], responses: Layout[Any], version: int) -> Ro
 
 def _is_of_each_node(server: RosPeerServer) -> bool:
     """Return whether this is one of the services that each node of ROS has for itself."""
-    if server.type:
-        return server.type.partition("/")[0] in _OF_EACH_NODE
-    return server.service.endswith(_OF_EACH_NODE_OF_ROS1)
+    return server.type.partition("/")[0] in _OF_EACH_NODE
 
 
 def _as_endpoint(server: RosPeerServer, end: str) -> RosPeerEndpoint:
     return RosPeerEndpoint(server.node, server.service + end, server.type, server.checksum)
-
-
-def _nothing_to_cancel() -> None: ...

@@ -8,7 +8,7 @@ and fields by the fingerprint that they announce; and where nobody here knows th
 import asyncio  # noqa: TC003 - the others are imported for good, too
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
 
-from r2p.clock import in_background
+from r2p.clock import sleep_in_background
 from r2p.codecs.management import ANY_TYPE
 from r2p.errors import MessageError
 from r2p.messages import Message, layout
@@ -139,7 +139,7 @@ class TopicClasses:
                 self._learnt[topic, fingerprint] = _standard(found)
                 self._changed(topic)
                 return
-            await self._pause()
+            await sleep_in_background(_TRY_AGAIN_S)
         del self._tasks[topic, fingerprint]  # the next change of the topic begins anew
 
     # Of ROS nodes
@@ -177,15 +177,6 @@ class TopicClasses:
             self._tasks = {key: task for key, task in self._tasks.items() if not task.done()}
         if len(self._tasks) < TABLE_MAX:
             self._tasks[key] = self._space.loop.create_task(ask(*args))
-
-    async def _pause(self) -> None:
-        over = self._space.loop.create_future()
-        timer = self._space.loop.call_later(_TRY_AGAIN_S, over.set_result, None)
-        in_background(timer)
-        try:
-            await over
-        finally:
-            timer.cancel()
 
 
 def _standard(cls: type[Message]) -> type[Message]:

@@ -32,8 +32,7 @@ def from_url(url: Url) -> Ros1Transport:
 
     Options: those of `r2p.ros.options`, and `host`: the address by which other computers reach this one, in place of
     `ROS_HOSTNAME` and `ROS_IP`. A program of its own, other than the command `r2p`, also takes what roslaunch adds to
-    its command line: `__name:=left`, `__ns:=/robot1`, `chatter:=/talk`,
-    `_kp:=0.7`.
+    its command line: `__name:=left`, `__ns:=/robot1`, `chatter:=/talk`, `_kp:=0.7`.
     """
     known: dict[str, Callable[[str], Any]] = {**URL_OPTIONS, "host": str}
     parsed = url.parsed(known)

@@ -49,7 +49,8 @@ class Ros1Middleware(Middleware):
     def __init__(self, address: RosAddress, lost: Counter[str] | None = None) -> None:
         self._context = Ros1Context(Counter() if lost is None else lost)
         self._address = address
-        self._session = MasterSession(address, self, self._context.lost)
+        self.session = MasterSession(address, self, self._context.lost)
+        """What talks to the master."""
         self._listeners: dict[str, TcprosListener] = {}
         self._publications: dict[tuple[str, str], Ros1Publication] = {}
         self._subscriptions: dict[str, Ros1Subscription] = {}
@@ -57,13 +58,8 @@ class Ros1Middleware(Middleware):
         """The slave URIs of each topic's publishers, by what the master has last reported to which node and topic."""
         self._servers: dict[tuple[str, str], Ros1Server] = {}
         self._callers = Ros1Callers(self._context)
-        self._probes = ServiceProbes(self._context, self._probe, lambda: self._session.look_soon())
+        self._probes = ServiceProbes(self._context, self._probe, lambda: self.session.look_soon())
         self._closing: set[TcprosConnection] = set()
-
-    @property
-    def session(self) -> MasterSession:
-        """Return what talks to the master."""
-        return self._session
 
     @property
     def lost(self) -> Counter[str]:
@@ -72,8 +68,7 @@ class Ros1Middleware(Middleware):
 
     @lost.setter
     def lost(self, lost: Counter[str]) -> None:
-        self._context.lost = lost
-        self._session = MasterSession(self._address, self, lost)  # nothing is declared yet
+        self._context.lost = self.session.lost = lost
 
     async def run(self, user: MiddlewareUser, opened: Callable[[], object]) -> None:
         self._context.begin(user)
@@ -81,14 +76,14 @@ class Ros1Middleware(Middleware):
             listener.start()
         asked = asyncio.get_running_loop().create_task(self._ask_keepalive())
         try:
-            await self._session.run(user, opened)
+            await self.session.run(user, opened)
         finally:
             asked.cancel()
             self._probes.close()
             await self._close()
 
     def set_sim_time(self) -> None:
-        self._session.hold_parameter("/use_sim_time", True)
+        self.session.hold_parameter("/use_sim_time", True)
 
     # Nodes
 
@@ -97,7 +92,7 @@ class Ros1Middleware(Middleware):
             self._listeners[node] = listener = TcprosListener(node, self._address.bind, self._context)
             if self._context.running:
                 listener.start()
-        self._session.add_node(node)
+        self.session.add_node(node)
 
     def remove_node(self, node: str) -> None:
         for publication in [each for each in self._publications.values() if each.endpoint.node == node]:
@@ -107,7 +102,7 @@ class Ros1Middleware(Middleware):
                 self.unsubscribe(endpoint)
         for server in [each for each in self._servers.values() if each.server.node == node]:
             self.unserve(server.server)
-        self._session.remove_node(node)
+        self.session.remove_node(node)
         listener = self._listeners.pop(node, None)
         if listener is not None:
             listener.close()
@@ -124,7 +119,7 @@ class Ros1Middleware(Middleware):
             self._end(before)
         publication = self._publications[node, topic] = Ros1Publication(endpoint, self._context)
         self._listeners[node].topics[topic] = publication
-        self._session.advertise(node, topic, endpoint.type.name)
+        self.session.advertise(node, topic, endpoint.type.name)
 
     def withdraw(self, endpoint: RosEndpoint) -> None:
         node, topic = endpoint.node, endpoint.topic
@@ -132,7 +127,7 @@ class Ros1Middleware(Middleware):
         if publication is None or publication.endpoint != endpoint:
             return  # another one has replaced it
         del self._publications[node, topic], self._listeners[node].topics[topic]
-        self._session.withdraw(node, topic)
+        self.session.withdraw(node, topic)
         self._end(publication)
 
     def publish(self, node: str, topic: str, data: bytes, stamp: int) -> None:
@@ -149,10 +144,10 @@ class Ros1Middleware(Middleware):
     def subscribe(self, endpoint: RosEndpoint) -> None:
         subscription = self._subscriptions.get(endpoint.topic)
         if subscription is None:
-            subscription = Ros1Subscription(self._context, self._session.client, endpoint.topic)
+            subscription = Ros1Subscription(self._context, self.session.client, endpoint.topic)
             self._subscriptions[endpoint.topic] = subscription
         subscription.endpoints.append(endpoint)
-        self._session.subscribe(endpoint.node, endpoint.topic, endpoint.type.name or ANY)
+        self.session.subscribe(endpoint.node, endpoint.topic, endpoint.type.name or ANY)
 
     def unsubscribe(self, endpoint: RosEndpoint) -> None:
         node, topic = endpoint.node, endpoint.topic
@@ -162,7 +157,7 @@ class Ros1Middleware(Middleware):
         before = subscription.type
         subscription.endpoints.remove(endpoint)
         if all(each.node != node for each in subscription.endpoints):
-            self._session.unsubscribe(node, topic)
+            self.session.unsubscribe(node, topic)
             self._publishers.pop((node, topic), None)
         if not subscription.endpoints:
             del self._subscriptions[topic]
@@ -173,7 +168,7 @@ class Ros1Middleware(Middleware):
             self._connect(subscription)
 
     async def describe(self, endpoint: RosPeerEndpoint) -> str:
-        session, node = self._session, self._any_node()
+        session, node = self.session, self._any_node()
         try:
             uri = await session.master.lookup_node(node, endpoint.node)
             return await definition_of(self._context, session.client, uri, node, endpoint.topic)
@@ -195,7 +190,7 @@ class Ros1Middleware(Middleware):
             before.close()
         listener = self._listeners[node]
         self._servers[node, service] = listener.services[service] = Ros1Server(server, self._context)
-        self._session.serve(node, service, listener.port)
+        self.session.serve(node, service, listener.port)
 
     def unserve(self, server: RosServer) -> None:
         node, service = server.node, server.service
@@ -203,13 +198,13 @@ class Ros1Middleware(Middleware):
         if known is None or known.server != server:
             return
         del self._servers[node, service], self._listeners[node].services[service]
-        self._session.unserve(node, service)
+        self.session.unserve(node, service)
         known.close()
 
     async def call(self, node: str, service: str, type: RosService, request: bytes, timeout: float) -> bytes:
         async with asyncio.timeout(timeout):
             try:
-                address = await self._session.find_service(node, service, timeout)
+                address = await self.session.find_service(node, service, timeout)
             except NoServer:
                 self._callers.forget(service)
                 raise
@@ -243,7 +238,7 @@ class Ros1Middleware(Middleware):
 
     async def _probe(self, service: str) -> RosService:
         node = self._any_node()
-        address = await self._session.find_service(node, service, PROBE_S)
+        address = await self.session.find_service(node, service, PROBE_S)
         return await self._callers.probe(node, service, address)
 
     def _connect(self, subscription: Ros1Subscription) -> None:
@@ -257,7 +252,7 @@ class Ros1Middleware(Middleware):
         backoff = Backoff(self._context.random)
         while True:
             try:
-                value = await self._session.master.get_param(self._any_node(), "/tcp_keepalive")
+                value = await self.session.master.get_param(self._any_node(), "/tcp_keepalive")
                 self._context.keepalive = bool(value)
             except MasterError:  # it is not set
                 return

@@ -11,7 +11,7 @@ import functools
 from collections import deque
 
 from r2p.errors import NoServer, ServiceError
-from r2p.ros.middleware import Cancel, RosServer, RosService
+from r2p.ros.middleware import Cancel, RosServer, RosService, nothing_to_cancel
 from r2p.ros.ros1.connections import Ros1Context, TcprosConnection, take_over
 from r2p.ros.ros1.tcpros import (
     MESSAGE_MAX,
@@ -52,7 +52,7 @@ class CallerConnection(TcprosConnection):
         self._requests: deque[bytes] = deque()
         self._answering = 0  # the number of the request that is being handled; 0: none
         self._number = 0
-        self._cancel: Cancel = _nothing
+        self._cancel: Cancel = nothing_to_cancel
         self._paused = False  # True while the caller does not read what was answered
         self._handing = False  # True while requests are handed over: one that is answered at once is not the end
 
@@ -145,10 +145,6 @@ class CallerConnection(TcprosConnection):
             self.close()
             return
         self._next()
-
-
-def _nothing() -> None:
-    """Cancel nothing: no request is being handled."""
 
 
 class Ros1Server:

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, cast
 
 from r2p.ros.link import RosLink
 from r2p.ros.options import RosOptions
@@ -11,9 +10,6 @@ from r2p.ros.ros1.middleware import Ros1Middleware
 from r2p.ros.ros1.parameters import ParameterMirror, node_names
 from r2p.ros.transport import RosTransport
 from r2p.transports.link import Hub
-
-if TYPE_CHECKING:
-    from r2p.modules.link_manager import LinkManager
 
 
 class Ros1Transport(RosTransport):
@@ -35,8 +31,8 @@ class Ros1Transport(RosTransport):
 
     async def run_link(self, hub: Hub, link: RosLink, opened: Callable[[], object]) -> None:
         assert isinstance(link.middleware, Ros1Middleware)
-        manager = cast("LinkManager", hub)
-        link.middleware.session.ends_without_nodes = lambda: manager.bridge is None and manager.links == [link]
+        space = hub.space
+        link.middleware.session.ends_without_nodes = lambda: not link.discovery.is_gateway and space.links == [link]
         if hub.observer:  # a command has no parameters
             await super().run_link(hub, link, opened)
             return
