@@ -52,6 +52,7 @@ from r2p.transports.stats import LoggedCounter
 
 _GATEWAYS_KEY = GATEWAYS.encode()
 _NOTHING = TopicType(), TopicType()
+_NOTICES_KEPT = 256  # texts that are not repeated
 _NOTICE_MAX = 2000  # characters of a notice, which may be another program's text
 _ROLES = (ROLE_PUBLISHES, ROLE_SUBSCRIBES)
 
@@ -106,6 +107,9 @@ class RosLink(BufferedLink, MiddlewareUser):
         """Topics that a ROS node latches."""
         self._sources: dict[str, Source] = {}
         self._notices: set[str] = set()
+        """The kinds of notices."""
+        self._noticed: set[tuple[str, str]] = set()
+        """Notices that are not repeated, by kind and text."""
         self._notice_limit = LineLimit()
         self._received_at = 0  # UTC in ns, of the last messages
         self._gateways = GatewayExchange(middleware, self.registrations, hub.space.clock)
@@ -464,11 +468,17 @@ class RosLink(BufferedLink, MiddlewareUser):
             REAL_TIME.reset(middleware_time)
 
     def notice(self, kind: str, text: str, *, trouble: bool) -> None:
+        text = text[:_NOTICE_MAX]
+        if (kind, text) in self._noticed:  # such as that of a connection which is tried again and again
+            return
+        if len(self._noticed) >= _NOTICES_KEPT:
+            self._noticed.clear()
+        self._noticed.add((kind, text))
         known = kind if kind in self._notices or len(self._notices) < TABLE_MAX else ""
         self._notices.add(known)
         suffix = self._notice_limit.suffix(known, self._clock.monotonic())
         if suffix is not None:
-            self._hub.link_notice(self, kind, text[:_NOTICE_MAX] + suffix, trouble=trouble)
+            self._hub.link_notice(self, kind, text + suffix, trouble=trouble)
 
     def shut_down(self, node: str, reason: str) -> None:
         self.registrations.forget_node(node)

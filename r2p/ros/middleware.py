@@ -172,7 +172,7 @@ class MiddlewareUser(Protocol):
         """Go on sending: `Middleware.full` was true, and is not any more."""
 
     def notice(self, kind: str, text: str, *, trouble: bool) -> None:
-        """Report something to the user, in words that say what to do, once for each `kind`."""
+        """Report something to the user, in words that say what to do. A text of one `kind` is reported once."""
 
     def shut_down(self, node: str, reason: str) -> None:
         """Note that another node has taken the name of one of the link's nodes, or that the master wants its end."""

@@ -50,9 +50,6 @@ from r2p.units import MILLISECOND
 _OF_EACH_NODE = frozenset({"rcl_interfaces", "type_description_interfaces", "roscpp"})
 """Packages of the services that each node has."""
 
-_NOTICES_MAX = 256
-"""Different notices of one link; further ones are left out."""
-
 
 class ServiceArrival(msgspec.Struct, frozen=True, gc=False):
     """A message on NAME_q or NAME_r, on its way to this module; `lifetime` in ns, 0: unknown."""
@@ -99,7 +96,6 @@ class RosServices:
         self._carried: dict[str, CarriedService] = {}
         self._by_ros_name: dict[str, CarriedService] = {}
         self._graph = RosGraph()
-        self._noticed: set[tuple[str, str]] = set()
         self._source = Source(link=link.name)
         self._sequence = 0
         self._instances: frozenset[int | None] = frozenset()
@@ -208,8 +204,6 @@ class RosServices:
         return bool(fitting)
 
     def _report_type(self, service: CarriedService, server: RosPeerEndpoint) -> None:
-        if not self._may_notice(server.node, service.name):
-            return
         mine = service.codec.type
         differs = f"{server.type}, here it is {mine.name}" if server.type != mine.name else f"another {mine.name}"
         self._link.notice(
@@ -243,13 +237,6 @@ class RosServices:
             codec, reason = None, str(error)
         self.not_on_ros.note(name, reason)
         return codec
-
-    def _may_notice(self, kind: str, what: str) -> bool:
-        """Return whether this was not said yet, as long as not too much was."""
-        is_new = (kind, what) not in self._noticed and len(self._noticed) < _NOTICES_MAX
-        if is_new:
-            self._noticed.add((kind, what))
-        return is_new
 
     def _layouts(self, name: str) -> tuple[Layout[Any], Layout[Any]] | None:
         """Return the layouts of both topics: those of this module's node, else from the options."""
@@ -344,8 +331,7 @@ class RosServices:
 
     def _report(self, service: CarriedService, text: str) -> None:
         """Report an error whose text does not reach the caller: an answer of its fixed length has no room for it."""
-        if self._may_notice(service.name, text):
-            self._link.notice("call failed", f"service {service.name} of a ROS node: {text}", trouble=True)
+        self._link.notice("call failed", f"service {service.name} of a ROS node: {text}", trouble=True)
 
 
 @functools.cache
