@@ -1,7 +1,7 @@
 """ROS 1 and ROS 2 without ROS: their types, and what travels between their nodes.
 
 definitions   .msg, .srv and .action files; what ROS 1 computes from them
-hashes        the hashes of types in ROS 2
+hashes        the hashes of types in ROS 2; type_names: how ROS writes the names of types
 classes       message classes of ROS types, and definitions of r2p's classes
 cdr           the serialisation of ROS 2; that of ROS 1 is r2p's own
 conversions   which types of r2p are which of ROS; `standard` and `reports` have the functions

@@ -22,10 +22,10 @@ import r2p.msg as ours
 from r2p.messages import Message, layout
 from r2p.ros import reports, standard
 from r2p.ros.classes import RosTypes
-from r2p.ros.definitions import short_name
 from r2p.ros.library import definitions_of_ros
 from r2p.ros.standard import FromRos, Functions, RosParts, ToRos
 from r2p.ros.standard import RosNames as RosNames  # a parameter of `conversion`
+from r2p.ros.type_names import short_name
 
 NO_NAMES = RosNames()
 

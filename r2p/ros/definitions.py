@@ -5,7 +5,7 @@
     parse_action    goal, `---`, result, `---`, feedback
     md5, definition_text    what the two ends of a connection of ROS 1 compare and send
 
-Names of types are `package/Name` here, as in ROS 1; ROS 2 puts the kind of file between both, `package/msg/Name`.
+Names of types are `package/Name` here, as in ROS 1.
 """
 
 import hashlib
@@ -17,6 +17,7 @@ import msgspec
 
 from r2p.errors import MessageError
 from r2p.messages.shapes import show
+from r2p.ros.type_names import NAME, short_name
 
 SEPARATOR = "=" * 80
 """The line between a definition and those of nested types."""
@@ -35,7 +36,6 @@ _TYPE = re.compile(
     r"(?P<base>[A-Za-z][A-Za-z0-9_]*(?:/(?:msg/)?[A-Za-z][A-Za-z0-9_]*)?)(?:<=(?P<text>[0-9]{1,9}))?"
     r"(?:\[(?P<bound><=)?(?P<count>[0-9]{0,9})\])?"
 )
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _NESTED_MAX = 512  # types in one definition
 
 
@@ -147,14 +147,6 @@ def _check_length(name: str, text: str) -> None:
         raise MessageError(f"the definition of {name} has {len(text)} characters, more than {TEXT_MAX}")
 
 
-def short_name(name: str) -> str:
-    """Return the name of a type as `package/Name`, also of one as ROS 2 writes it. Raises MessageError."""
-    package, *kind, last = name.split("/") if "/" in name else ("", name)
-    if not (_NAME.fullmatch(package) and _NAME.fullmatch(last) and kind in ([], ["msg"], ["srv"], ["action"])):
-        raise MessageError(f"{show(name)} is not the name of a ROS type, such as sensor_msgs/Imu")
-    return f"{package}/{last}"
-
-
 def _parse_one(name: str, text: str) -> MessageDefinition:
     fields: list[FieldDefinition] = []
     constants: list[ConstantDefinition] = []
@@ -195,13 +187,13 @@ def _parse_line(bare: str, line: str, package: str) -> FieldDefinition | Constan
     type_text, _, rest = bare.replace("\t", " ").partition(" ")
     kind = _field_type(type_text, package)
     name, equals, _ = rest.partition("=")
-    if equals and _NAME.fullmatch(name.strip()):
+    if equals and NAME.fullmatch(name.strip()):
         value = line.partition("=")[2] if type_text == "string" else bare.partition("=")[2]
         if kind.count is not None or not kind.is_builtin:
             raise MessageError(f"{show(bare)}: a constant is a number, a bool or a text")
         return ConstantDefinition(name.strip(), type_text, value.strip())
     name, _, default = rest.strip().partition(" ")
-    if not _NAME.fullmatch(name):
+    if not NAME.fullmatch(name):
         raise MessageError(f"{show(bare)} is not a field, as in `float32 range`, or a constant, as in `uint8 OK=0`")
     return FieldDefinition(name, kind, default.strip())
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from r2p.errors import MessageError
 from r2p.ros.definitions import Definitions, FieldDefinition, FieldType, parse
+from r2p.ros.type_names import ros2_name
 
 _IDS = {
     "int8": 2,
@@ -63,7 +64,7 @@ class TypeDescriptions:
 
     def add(self, name: str, fields: Fields) -> None:
         """Add a type: a message if its name is `package/Name`."""
-        self._fields[full_name(name)] = fields or (_EMPTY,)
+        self._fields[ros2_name(name)] = fields or (_EMPTY,)
 
     def add_service(self, name: str, request: Fields, response: Fields) -> None:
         """Add the four types of a service, `package/srv/Name`: itself, and what is called, answered and recorded."""
@@ -101,7 +102,7 @@ class TypeDescriptions:
 
         Raises MessageError for a missing type.
         """
-        name = full_name(name)
+        name = ros2_name(name)
         nested: set[str] = set()
         self._collect(name, (), nested)
         return {
@@ -128,11 +129,6 @@ class TypeDescriptions:
         return {"type_name": name, "fields": fields}
 
 
-def full_name(name: str) -> str:
-    """Return the name of a type as ROS 2 writes it."""
-    return name if name.count("/") > 1 else name.replace("/", "/msg/")
-
-
 def _members(**types: str) -> Fields:
     return tuple(FieldDefinition(name, FieldType(base)) for name, base in types.items())
 
@@ -140,7 +136,7 @@ def _members(**types: str) -> Fields:
 def _nested_name(kind: FieldType) -> str:
     """Return the full name of the type of a field; empty for a builtin one."""
     base = _OF_ROS1.get(kind.base, kind.base)
-    return full_name(base) if "/" in base else ""
+    return ros2_name(base) if "/" in base else ""
 
 
 def _describe_type(kind: FieldType) -> dict[str, Any]:

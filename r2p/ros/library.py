@@ -15,9 +15,10 @@ from typing import Any
 from r2p.errors import MessageError
 from r2p.messages import Message, layout
 from r2p.ros.classes import HEADER, RosTypes, definitions_of
-from r2p.ros.definitions import Definitions, MessageDefinition, md5, parse, parse_action, parse_service, short_name
+from r2p.ros.definitions import Definitions, MessageDefinition, md5, parse, parse_action, parse_service
 from r2p.ros.hashes import TypeDescriptions
 from r2p.ros.packages import OF_ROS
+from r2p.ros.type_names import ros2_name, short_name
 
 _PARTS = {".srv": parse_service, ".action": parse_action}
 _MISSING = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
@@ -32,7 +33,7 @@ def definitions_of_ros(name: str, version: int) -> dict[str, MessageDefinition]:
     """
     name = short_name(name)
     store = _store(version)
-    full = name.replace("/", "/msg/")
+    full = ros2_name(name)
     if full not in store.types:
         close = difflib.get_close_matches(name, names_of_ros(version), n=1)
         advice = f"did you mean {close[0]}?" if close else "give the path of its .msg file"
@@ -158,6 +159,6 @@ def definitions_with_those_of_ros(cls: type[Message], version: int) -> dict[str,
     """
     found = definitions_of(cls, version)
     for name in [each for each in found if each not in (layout(cls).name, HEADER)]:
-        if name.partition("/")[0] in OF_ROS and short_name(name).replace("/", "/msg/") in _store(version).types:
+        if name.partition("/")[0] in OF_ROS and ros2_name(short_name(name)) in _store(version).types:
             found |= definitions_of_ros(name, version)
     return found

@@ -23,6 +23,7 @@ from r2p.ros.definitions import service_md5
 from r2p.ros.hashes import TypeDescriptions
 from r2p.ros.library import definitions_with_those_of_ros
 from r2p.ros.middleware import RosService
+from r2p.ros.type_names import ros2_name
 from r2p.services.definition import Definition
 
 Convert: TypeAlias = Callable[[bytes], bytes]
@@ -53,7 +54,7 @@ def service_shape(requests: Layout[Any], responses: Layout[Any]) -> ServiceShape
     """
     name = requests.name.removesuffix(REQUESTS).removesuffix("Request").removesuffix("_")
     request, response = (
-        layout(with_names(_body(each).cls, f"{ros2_service_name(name)}_{part}"))
+        layout(with_names(_body(each).cls, f"{ros2_name(name, 'srv')}_{part}"))
         for each, part in ((requests, "Request"), (responses, "Response"))
     )
     return ServiceShape(name, request, response, requests, responses)
@@ -75,14 +76,9 @@ def service_type(shape: ServiceShape, version: int) -> RosService:
     found = definitions_with_those_of_ros(request.cls, version) | definitions_with_those_of_ros(response.cls, version)
     if version == 1:
         return RosService(shape.name, service_md5(request.name, response.name, found))
-    types, full_name = TypeDescriptions(found), ros2_service_name(shape.name)
+    types, full_name = TypeDescriptions(found), ros2_name(shape.name, "srv")
     types.add_service(full_name, found[request.name].fields, found[response.name].fields)
     return RosService(shape.name, types.hash(full_name))
-
-
-def ros2_service_name(name: str) -> str:
-    """Return the name of a service's type as ROS 2 writes it: `std_srvs/srv/SetBool`."""
-    return name if name.count("/") > 1 else name.replace("/", "/srv/")
 
 
 # Bytes

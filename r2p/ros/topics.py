@@ -18,12 +18,13 @@ from r2p.names import BUS_LOAD, BUS_SLOTS, LOADER_PREFIX, RESERVED
 from r2p.ros.cdr import HEADER, cdr, packed_size
 from r2p.ros.classes import RosTypes, definitions_of, standard_classes
 from r2p.ros.conversions import Conversion, RosNames, conversion, standard_type
-from r2p.ros.definitions import definition_text, parse, short_name
+from r2p.ros.definitions import definition_text, parse
 from r2p.ros.library import definitions_of_ros, ros1_md5, ros2_hash
 from r2p.ros.middleware import RosType
 from r2p.ros.options import RosOptions, lookup
 from r2p.ros.packages import OF_ROS
 from r2p.ros.stamps import StampSource, stamp_of
+from r2p.ros.type_names import short_name
 from r2p.runtime.sample import Sample
 
 _OWN = frozenset({*RESERVED, BUS_LOAD, BUS_SLOTS, "gateway"})

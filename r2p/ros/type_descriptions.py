@@ -23,11 +23,11 @@ from r2p.ros.definitions import (
     parse,
     parse_service,
     plain_text,
-    short_name,
 )
-from r2p.ros.hashes import TypeDescriptions, field_type, full_name
+from r2p.ros.hashes import TypeDescriptions, field_type
 from r2p.ros.library import definitions_with_those_of_ros
 from r2p.ros.middleware import Middleware, RosPeerEndpoint, RosService
+from r2p.ros.type_names import ros2_name, short_name
 
 NAME = "get_type_description"
 """The service, below the name of its node."""
@@ -78,7 +78,7 @@ def _class(name: str) -> type[Message]:
 def service() -> RosService:
     """Return the type of the service."""
     found, name = _definitions(), f"{_PACKAGE}/GetTypeDescription"
-    types, full = TypeDescriptions(found), name.replace("/", "/srv/")
+    types, full = TypeDescriptions(found), ros2_name(name, "srv")
     types.add_service(full, found[f"{name}_Request"].fields, found[f"{name}_Response"].fields)
     return RosService(name, types.hash(full))
 
@@ -93,7 +93,7 @@ def describe(request: bytes, classes: Iterable[type[Message]]) -> bytes:
     """
     asked: Any = cdr(_class("GetTypeDescription_Request")).decode(request)
     for cls in classes:
-        if full_name(layout(cls).name) == asked.type_name:
+        if ros2_name(layout(cls).name) == asked.type_name:
             found = _described(cls)
             if found is not None and asked.type_hash in ("", found[0]):
                 return response_with(found[1], found[2] if asked.include_type_sources else {})
@@ -117,7 +117,7 @@ def response_with(description: dict[str, Any], sources: Definitions) -> bytes:
     """Return the answer with this description (`TypeDescriptions.description`), and the texts of these definitions."""
     kind, source = _class("GetTypeDescription_Response"), _class("TypeSource")
     texts = (
-        source(type_name=full_name(name), encoding="msg", raw_file_contents=each.text) for name, each in sources.items()
+        source(type_name=ros2_name(name), encoding="msg", raw_file_contents=each.text) for name, each in sources.items()
     )
     whole = _class("TypeDescription")(
         type_description=_individual(description["type_description"]),
@@ -149,7 +149,7 @@ async def ask(middleware: Middleware, node: str, peer: RosPeerEndpoint) -> str:
 def request_for(name: str, checksum: str) -> bytes:
     """Return the request for the description of a type (`package/Name`)."""
     kind = _class("GetTypeDescription_Request")
-    return cdr(kind).encode(kind(type_name=full_name(name), type_hash=checksum, include_type_sources=False))
+    return cdr(kind).encode(kind(type_name=ros2_name(name), type_hash=checksum, include_type_sources=False))
 
 
 def definition_in(response: bytes) -> str:

@@ -178,9 +178,9 @@ async def import_(
     those that come with ROS (pip install 'r2p[ros]').
     """
     from r2p.ros.classes import RosTypes
-    from r2p.ros.definitions import short_name
     from r2p.ros.library import DefinitionFile, definitions_of_ros
     from r2p.ros.source import PARTS, source, source_of_parts
+    from r2p.ros.type_names import short_name
 
     version = 1 if ros1 else 2
     suffix = Path(type).suffix

@@ -108,11 +108,12 @@ def load_interface(text: str) -> tuple[str, list[type[r2p.Message]]] | None:
             types = action_types(found)
             return types.name.replace("/", "/action/"), [types.goal, types.result, types.feedback]
         if hasattr(found, "Request") and hasattr(found, "Response"):
-            from r2p.ros.service_types import ros2_service_name, service_shape
+            from r2p.ros.service_types import service_shape
+            from r2p.ros.type_names import ros2_name
 
             definition = define("service", found)
             shape = service_shape(definition.requests, definition.responses)
-            return ros2_service_name(shape.name), [definition.request.cls, definition.response.cls]
+            return ros2_name(shape.name, "srv"), [definition.request.cls, definition.response.cls]
     except r2p.MessageError as error:
         raise UsageError(f"{text}: {error}") from error
     return None

@@ -10,7 +10,8 @@ import r2p
 from r2p.messages import SIZE_MAX, Duration, Timestamp
 from r2p.messages.shapes import FixedArray, Nested, Scalar, Shape, VariableArray
 from r2p.ros.classes import RosTypes
-from r2p.ros.definitions import MessageDefinition, parse, parse_action, parse_service, short_name
+from r2p.ros.definitions import MessageDefinition, parse, parse_action, parse_service
+from r2p.ros.type_names import short_name
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "ros"
 

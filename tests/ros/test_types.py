@@ -18,9 +18,9 @@ from r2p.ros.definitions import (
     parse_service,
     plain_text,
     service_md5,
-    short_name,
 )
 from r2p.ros.hashes import TypeDescriptions
+from r2p.ros.type_names import short_name
 from r2p.tools.types import standard_types
 from tests.ros.recorded import definitions, recorded
 

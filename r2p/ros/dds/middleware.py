@@ -18,8 +18,9 @@ from r2p.clock import real_clock, real_time
 from r2p.errors import ServiceError
 from r2p.ros.dds.cyclone import DdsEvents, Participant
 from r2p.ros.dds.graph import DdsEndpoint, DdsGraph, OwnNode, announce
-from r2p.ros.dds.names import DISCOVERY, dds_topic, dds_type, user_data
+from r2p.ros.dds.names import DISCOVERY, dds_topic, user_data
 from r2p.ros.middleware import Middleware, MiddlewareUser, Qos, RosArrival, RosEndpoint, RosServer, RosService, RosType
+from r2p.ros.type_names import dds_type
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.units import SECOND
 

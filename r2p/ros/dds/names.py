@@ -8,7 +8,8 @@
 | enclave | `enclave=/;` in the user data of the participant |
 """
 
-from r2p.ros.hashes import full_name
+from r2p.errors import DecodeError
+from r2p.ros.type_names import type_of_dds
 
 TOPIC = "rt"
 """What stands before the names of topics; those of services begin with `rq` and `rr`."""
@@ -28,19 +29,12 @@ def ros_topic(name: str) -> str:
     return f"/{rest}" if prefix == TOPIC and slash and rest else ""
 
 
-def dds_type(name: str) -> str:
-    """Return the name in DDS of a type: `std_msgs/String` is `std_msgs::msg::dds_::String_`."""
-    package, kind, last = full_name(name).split("/")
-    return f"{package}::{kind}::dds_::{last}_"
-
-
 def ros_type(name: str) -> str:
-    """Return the name of a type in ROS; empty for one that is not of ROS."""
-    package, *rest = name.split("::")
-    if len(rest) != 3 or rest[1] != "dds_" or len(rest[2]) < 2 or not rest[2].endswith("_"):
+    """Return the name here of a type in DDS; empty for one that is not of ROS."""
+    try:
+        return type_of_dds(name)
+    except DecodeError:
         return ""
-    kind, last = rest[0], rest[2][:-1]
-    return f"{package}/{last}" if kind == "msg" else f"{package}/{kind}/{last}"
 
 
 def user_data(checksum: str) -> bytes:

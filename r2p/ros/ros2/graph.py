@@ -5,7 +5,8 @@ from typing import Any
 
 from r2p.errors import DecodeError
 from r2p.ros.middleware import RosGraph, RosPeerEndpoint, RosPeerServer
-from r2p.ros.ros2.keys import NO_HASH, EntityKind, RmwToken, decode_token, gid_of, ros_type
+from r2p.ros.ros2.keys import NO_HASH, EntityKind, RmwToken, decode_token, gid_of
+from r2p.ros.type_names import type_of_dds
 from r2p.transports.stats import LoggedCounter
 
 TOKENS_MAX = 65_536
@@ -110,10 +111,10 @@ def _peer(key: str, token: RmwToken) -> Any:
     """Return what the graph has of a token."""
     match token.kind:
         case EntityKind.PUBLISHER | EntityKind.SUBSCRIBER:
-            name = ros_type(token.type)
+            name = type_of_dds(token.type)
             return RosPeerEndpoint(token.node, token.name, name, token.checksum, token.qos, gid_of(key))
         case EntityKind.SERVER:
-            return RosPeerServer(token.node, token.name, ros_type(token.type), token.checksum)
+            return RosPeerServer(token.node, token.name, type_of_dds(token.type), token.checksum)
         case _:
             return None
 
@@ -127,7 +128,7 @@ def explain_mismatch(own: RmwToken, other: RmwToken) -> str:
         return ""
     verb, what = _WORDS[other.kind]
     start = f"node {other.node} {verb} the {what} {other.name}"
-    theirs, ours = ros_type(other.type), ros_type(own.type)
+    theirs, ours = type_of_dds(other.type), type_of_dds(own.type)
     if theirs != ours:
         return f"{start} as {theirs}, and {own.node} has it as {ours}: give both one type (--ros-type), or another name"
     if other.checksum == NO_HASH:

@@ -25,6 +25,7 @@ import xxhash
 from r2p.errors import DecodeError
 from r2p.ros.middleware import Qos
 from r2p.ros.ros2.qos import decode_qos, encode_qos
+from r2p.ros.type_names import type_of_dds
 
 TOKENS = "@ros2_lv"
 """The first part of the key of each liveliness token."""
@@ -40,11 +41,9 @@ _START = struct.Struct("<qqB")
 _TOKEN_MAX = 2048  # characters; names in ROS have at most 255
 _NODE_FIELDS, _ENDPOINT_FIELDS = 9, 13
 _NAME = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)+")
-_TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)::(msg|srv|action)::(?:dds_::)?([A-Za-z][A-Za-z0-9_]*?)_?")
 _NUMBER = re.compile(r"[0-9]{1,19}")
 _SESSION = re.compile(r"[0-9a-f]{1,32}")
 _HASH = re.compile(r"RIHS[0-9]{2}_[0-9a-f]{64}")
-_PARTS_OF_ACTIONS = ("_SendGoal", "_GetResult", "_FeedbackMessage")
 
 
 class EntityKind(StrEnum):
@@ -91,25 +90,6 @@ def data_key(domain: int, name: str, type: str, checksum: str) -> str:
     return f"{domain}/{name.strip('/')}/{type}/{checksum}"
 
 
-def dds_type(name: str, *, service: bool = False) -> str:
-    """Return a type as in keys: `std_msgs/String` and `std_msgs/msg/String` -> `std_msgs::msg::dds_::String_`."""
-    package, *kind, last = name.split("/")
-    default = "action" if last.endswith(_PARTS_OF_ACTIONS) else "srv" if service else "msg"
-    return f"{package}::{kind[0] if kind else default}::dds_::{last}_"
-
-
-def ros_type(type: str) -> str:
-    """Return the name of a type in a key: `std_msgs/String`; that of an action's part is `PACKAGE/action/NAME`.
-
-    Raises DecodeError.
-    """
-    found = _TYPE.fullmatch(type)
-    if found is None:
-        raise DecodeError(f"{type[:80]!r} is not a type of ROS 2")
-    package, kind, name = found.groups()
-    return f"{package}/action/{name}" if kind == "action" else f"{package}/{name}"
-
-
 def gid_of(token: str) -> bytes:
     """Return the gid of the endpoint with this token."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(GID_BYTES, "little")
@@ -149,7 +129,7 @@ def _decode_endpoint(fields: list[str]) -> tuple[str, str, str, Qos]:
     topic = _full(name)
     if not is_full_name(topic) or not (_HASH.fullmatch(checksum) or checksum == NO_HASH):
         raise DecodeError(f"a token of {topic[:80]!r} with the hash {checksum[:80]!r}")
-    ros_type(dds_name)
+    type_of_dds(dds_name)
     return topic, dds_name, checksum, decode_qos(qos)
 
 

@@ -7,9 +7,10 @@ import asyncio
 from collections.abc import Callable
 
 from r2p.ros.ros2.graph import explain_mismatch
-from r2p.ros.ros2.keys import TOKENS, EntityKind, RmwToken, gid_of, ros_type
+from r2p.ros.ros2.keys import TOKENS, EntityKind, RmwToken, gid_of
 from r2p.ros.ros2.qos import lost_between
 from r2p.ros.ros2.session import RmwSession
+from r2p.ros.type_names import type_of_dds
 from r2p.transports.zenoh.link import TokenDebouncer
 
 _GRAPH_S = 0.02  # seconds in which changes of the graph are reported as one
@@ -134,7 +135,7 @@ class RmwMatches:
             self._explain(own, other, text)
             return
         if other.kind == EntityKind.PUBLISHER:
-            type_name, latched = ros_type(other.type), other.qos.transient_local
+            type_name, latched = type_of_dds(other.type), other.qos.transient_local
             self._user.publisher_found(other.name, other.node, type_name, "", latched=latched)
             text = lost_between(other.qos, own.qos)
         elif other.kind == EntityKind.SUBSCRIBER:

@@ -22,13 +22,13 @@ from r2p.ros.ros2.keys import (
     GID_BYTES,
     EntityKind,
     data_key,
-    dds_type,
     decode_attachment,
     encode_attachment,
     encode_token,
     gid_of,
 )
 from r2p.ros.ros2.session import RmwSession
+from r2p.ros.type_names import dds_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable

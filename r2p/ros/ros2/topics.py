@@ -23,13 +23,13 @@ from r2p.ros.ros2.keys import (
     EntityKind,
     RmwToken,
     data_key,
-    dds_type,
     decode_attachment,
     encode_attachment,
     encode_token,
     gid_of,
 )
 from r2p.ros.ros2.session import RmwSession
+from r2p.ros.type_names import dds_type
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.transports.link import MESSAGES_PER_TURN
 from r2p.transports.zenoh.large import LARGE

@@ -5,8 +5,9 @@ from hypothesis import strategies as st
 
 from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.ros.dds.graph import DdsEndpoint, DdsGraph, OwnNode, announce
-from r2p.ros.dds.names import checksum_in, dds_topic, dds_type, ros_topic, ros_type, user_data
+from r2p.ros.dds.names import checksum_in, dds_topic, ros_topic, ros_type, user_data
 from r2p.ros.middleware import Qos
+from r2p.ros.type_names import dds_type
 
 PEER, SCAN, POSE = b"p" * 16, b"s" * 16, b"o" * 16
 
@@ -32,7 +33,7 @@ def test_names() -> None:
         "",
         "",
     ]
-    assert [ros_type(name) for name in ("A", "a::b", "a::msg::B_", "a::msg::dds_::_")] == [""] * 4
+    assert [ros_type(name) for name in ("A", "a::b", "a::idl::dds_::B_", "a::msg::dds_::_")] == [""] * 4
     assert checksum_in(user_data("RIHS01_ab") + b"\0") == "RIHS01_ab"
     assert checksum_in(b"enclave=/;\xff") == ""
 

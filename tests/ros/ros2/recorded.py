@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from r2p.ros.middleware import Qos
-from r2p.ros.ros2.keys import dds_type
+from r2p.ros.type_names import dds_type
 
 SESSION = "c0ffee"
 """The session in the place of those that the recording leaves out."""

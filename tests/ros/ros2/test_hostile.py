@@ -7,10 +7,10 @@ from r2p.ros.ros2.keys import (
     ATTACHMENT,
     EntityKind,
     data_key,
-    dds_type,
     decode_attachment,
     encode_attachment,
 )
+from r2p.ros.type_names import dds_type
 from r2p.transports.stats import LoggedCounter
 from tests.ros.ros2.network import STRING, endpoint, joined, router
 from tests.ros.ros2.recorded import SESSION, recorded

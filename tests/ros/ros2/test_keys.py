@@ -14,15 +14,14 @@ from r2p.ros.ros2.keys import (
     EntityKind,
     RmwToken,
     data_key,
-    dds_type,
     decode_attachment,
     decode_token,
     encode_attachment,
     encode_token,
     gid_of,
     is_full_name,
-    ros_type,
 )
+from r2p.ros.type_names import dds_type, type_of_dds
 from tests.ros.ros2.recorded import SESSION, SET_BOOL_HASH, STRING_HASH, qos_of, recorded, type_of
 
 Case = dict[str, Any]
@@ -82,12 +81,12 @@ def test_types() -> None:
     for case in recorded()["types"]:
         if case["pamoja_dds"] is None:
             with pytest.raises(r2p.DecodeError):
-                ros_type(case["sdk_dds"])
+                type_of_dds(case["sdk_dds"])
             continue
         assert dds_type(case["type"]) == case["pamoja_dds"] == case["sdk_dds"]
         assert case["pamoja_key"].startswith(data_key(0, "/x", dds_type(case["type"]), "RIHS01_"))
         package, kind, name = case["type"].split("/")
-        assert ros_type(case["sdk_dds"]) == (case["type"] if kind == "action" else f"{package}/{name}")
+        assert type_of_dds(case["sdk_dds"]) == (case["type"] if kind == "action" else f"{package}/{name}")
         assert case["sdk_back"] == case["type"]
     assert dds_type("std_msgs/String") == "std_msgs::msg::dds_::String_"
     assert dds_type("std_srvs/SetBool", service=True) == "std_srvs::srv::dds_::SetBool_"
@@ -106,9 +105,9 @@ def test_graph() -> None:
                 assert case["note"] in ("twelve fields only", "unknown kind", "node id is not a number")
                 continue
             if token.kind in (EntityKind.PUBLISHER, EntityKind.SUBSCRIBER):
-                topics.setdefault(token.name, set()).add(ros_type(token.type).replace("/", "/msg/"))
+                topics.setdefault(token.name, set()).add(type_of_dds(token.type).replace("/", "/msg/"))
             elif token.kind == EntityKind.SERVER:
-                services.setdefault(token.name, set()).add(ros_type(token.type).replace("/", "/srv/"))
+                services.setdefault(token.name, set()).add(type_of_dds(token.type).replace("/", "/srv/"))
         assert topics == {name: {*types} for name, types in case["topics_hidden"]}, case["note"]
         assert services == {name: {*types} for name, types in case["services"]}, case["note"]
 

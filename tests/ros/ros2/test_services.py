@@ -10,7 +10,8 @@ import zenoh
 
 import r2p
 from r2p.ros.middleware import RosPeerServer, RosService
-from r2p.ros.ros2.keys import NO_HASH, data_key, dds_type, decode_attachment, encode_attachment
+from r2p.ros.ros2.keys import NO_HASH, data_key, decode_attachment, encode_attachment
+from r2p.ros.type_names import dds_type
 from tests.ros.ros2.network import SET_BOOL, Recorder, RouterOfTests, endpoint, joined, router, server
 from tests.ros.ros2.recorded import recorded
 
