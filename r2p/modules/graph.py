@@ -46,7 +46,8 @@ class TopicView(msgspec.Struct):
     """A topic, as far as this module knows it.
 
     `size` is in bytes (0: unknown); that of the longest message, if their length `varies`. `fingerprint` is that of its
-    layout (None: unknown). `layout` is set only where this module uses the topic.
+    layout (None: unknown). `layout` is set only where this module uses the topic. `ros_type` is what ROS nodes call the
+    type, `package/Name`; empty: no ROS node has the topic.
 
     `publishers` and `subscribers` list endpoints whose node is known; `published_on` and `subscribed_on` name all links
     ("": this module) on which it is published and subscribed. `age` is in seconds since it was last announced.
@@ -63,6 +64,7 @@ class TopicView(msgspec.Struct):
     age: float | None = None
     mismatch: bool = False
     varies: bool = False
+    ros_type: str = ""
 
 
 class ModuleView(msgspec.Struct):
@@ -303,6 +305,7 @@ def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
         view.varies |= info.varies
         view.fingerprint = view.fingerprint or info.fingerprint
         view.mismatch |= info.mismatch
+        view.ros_type = view.ros_type or info.type_name
         if info.advertised_at is not None:
             _add(view.published_on, link.name)
         if info.requested_at is not None:

@@ -289,6 +289,8 @@ class RosDiscovery(DiscoveryProtocol):
         carried = {topic for topic, _ in self.peers}
         for topic in self.topics.keys() - carried:
             del self.topics[topic]
+        for topic, info in self.topics.items():
+            info.type_name = next((each.type for each in self.peers_of(topic) if "/" in each.type), "")
         changed = (key for key in before.keys() | self.peers.keys() if before.get(key) != self.peers.get(key))
         self._dirty |= dict.fromkeys(sorted({topic for topic, _ in changed}))
         self._mark_at = now + _MARK_EVERY if graph.nodes or self.peers else None

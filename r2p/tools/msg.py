@@ -7,13 +7,24 @@ from typing import Annotated, Any
 import typer
 
 import r2p
+from r2p.codecs.services import REQUESTS
 from r2p.messages import SIZE_MAX
 from r2p.tools.c_header import c_header, header_path, with_nested
 from r2p.tools.completion import beginning, complete_type, silence
 from r2p.tools.options import Format
 from r2p.tools.output import Output, notify
 from r2p.tools.session import UsageError, group, settings, standalone
-from r2p.tools.types import Types, class_path, load_interface, put_sizes, size_text, standard_types, type_name
+from r2p.tools.types import (
+    Types,
+    class_path,
+    is_service,
+    load_interface,
+    load_service,
+    put_sizes,
+    size_text,
+    standard_types,
+    type_name,
+)
 
 app = group("Show message types, and exchange them with C and ROS.")
 
@@ -47,20 +58,51 @@ async def list_(*, format: Format = None) -> None:
 @app.command("show")
 @standalone
 async def show(type: TypeArgument, *, format: Format = None) -> None:
-    """Show a type: its size, fingerprint, sums in ROS, and fields."""
+    """Show a type: its size, fingerprint, sums in ROS, and fields.
+
+    Of a service, std_srvs/SetBool or a class of your own: its sums in ROS, and the fields of request and response.
+    """
     output = Output(format)
+    if is_service(type):
+        await output.put(_service(type))
+        return
     cls = Types(settings()).load(type)
     shape = r2p.layout(cls)
-    pairs = (field.rpartition(":") for field in shape.schema.split())
     record = _row(cls) | {
         "fingerprint": shape.fingerprint.hex(),
         "ros1_md5": _of_ros(cls, "ros1_md5"),
         "ros2_hash": _of_ros(cls, "ros2_hash"),
-        "fields": {path: kind for path, _, kind in pairs},
+        "fields": _fields(shape),
     }
     if output.format == "text":
         record["size"] = size_text(shape.size, varies=shape.varies)
     await output.put(record)
+
+
+def _service(text: str) -> dict[str, Any]:
+    """Return what `show` prints of a service. Raises UsageError."""
+    from r2p.ros.service_types import service_shape, service_type
+
+    known = load_service("service", text)
+    sums: list[str | None] = []
+    try:
+        shape = service_shape(known.requests, known.responses)
+        name = shape.name
+        sums = [service_type(shape, version).checksum for version in (1, 2)]
+    except r2p.MessageError:  # ROS can't define it, or has other fields in a type of that name
+        name, sums = known.requests.name.removesuffix(REQUESTS).removesuffix("_Request"), [None, None]
+    return {
+        "type": name,
+        "ros1_md5": sums[0],
+        "ros2_hash": sums[1],
+        "request_fields": _fields(known.request),
+        "response_fields": _fields(known.response),
+    }
+
+
+def _fields(shape: r2p.Layout[Any]) -> dict[str, str]:
+    """Return the kind of each field by its path."""
+    return {path: kind for path, _, kind in (field.rpartition(":") for field in shape.schema.split())}
 
 
 def _of_ros(cls: type[r2p.Message], what: str) -> str | None:

@@ -3,7 +3,8 @@
 A peer announces the fingerprint of a layout. It is looked up in `r2p.msg` and in the classes that r2p.toml names; then,
 on zenoh, modules that have such a type are queried for its fields.
 
-Types are shown by their full names, `package/Name`, which `--type` takes wherever the class is known.
+Types are shown by their full names, `package/Name`, which `--type` takes wherever the class is known. Several names may
+have one layout, `std_msgs/Float32` and `r2p_msgs/Float32`: of a topic on ROS, the name is that which it has there.
 """
 
 import asyncio
@@ -230,13 +231,14 @@ class Types:
     def describe(self, view: r2p.TopicView) -> dict[str, Any]:
         """Return name, type and size of a topic as a record; None is what is unknown.
 
-        Where the length of its messages `varies`, the size is that of the longest one.
+        Where the length of its messages `varies`, the size is that of the longest one. ROS nodes that have the topic
+        decide what its type is called.
         """
         cls = self.of(view)
         size = view.size or (0 if view.varies else None)
         if view.varies and view.size == SIZE_CUT and cls is not None:
             size = max(SIZE_CUT, r2p.layout(cls).size)
-        name = None if cls is None else type_name(cls)
+        name = view.ros_type or (None if cls is None else type_name(cls))
         return {"topic": view.name, "type": name, "size": size, "varies": view.varies}
 
     async def learn(self, session: Session, view: r2p.TopicView) -> type[r2p.Message] | None:

@@ -5,8 +5,11 @@ import asyncio
 import pytest
 
 import r2p
-from r2p.msg import String
+from r2p.msg import Float32, String
+from r2p.ros.topics import ros_class
 from r2p.testing.network import node_in
+from r2p.tools.config import Settings
+from r2p.tools.types import Types
 from tests.ros.fake import FakeRosNetwork
 
 both = pytest.mark.parametrize("version", [1, 2])
@@ -37,3 +40,22 @@ async def test_two_tools_do_not_take_each_others_names(version: int) -> None:
     assert seen["talker"] == ("ROS", "running")
     assert seen["r2p_tool_echo_aaaaaa"] == ("ROS", "observer")
     assert seen["PC1"] == ("r2p", "running")
+
+
+@both
+@pytest.mark.virtual_time
+async def test_a_topic_has_the_type_that_ros_nodes_call_it_by(version: int) -> None:
+    """std_msgs/Float32 and r2p_msgs/Float32 have the same fields."""
+    network = FakeRosNetwork(version)
+    thermometer = network.node("/thermometer")
+    thermometer.advertise("/temperature", ros_class("std_msgs/Float32", version))
+    async with r2p.Module("PC1", via=network.transport()) as program:
+        await asyncio.sleep(1)
+        view = program.network.topics()["temperature"]
+        shown = Types(Settings()).describe(view)
+        thermometer.close()
+        await asyncio.sleep(1)
+        later = program.network.topics().get("temperature")
+    assert view.fingerprint == r2p.layout(Float32).fingerprint
+    assert (view.ros_type, shown["type"]) == ("std_msgs/Float32", "std_msgs/Float32")
+    assert later is None

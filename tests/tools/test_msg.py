@@ -80,6 +80,17 @@ def test_show() -> None:
     }
 
 
+def test_show_of_a_service() -> None:
+    """The sums are those of `rosservice` (`SetBool._md5sum`) and of rclpy."""
+    assert json.loads(run("show", "std_srvs/SetBool").stdout) == {
+        "type": "std_srvs/SetBool",
+        "ros1_md5": "09fb03525b03e7ea1fd3992bafd87e16",
+        "ros2_hash": "RIHS01_abe9e4bb6b41b40e6789712c00ec8871923e089af3f667a79992a428cff2da0a",
+        "request_fields": {"data": "bool"},
+        "response_fields": {"success": "bool", "message": "str"},
+    }
+
+
 @pytest.mark.skipif(not COMPILERS, reason="no C compiler: apt-get install gcc g++")
 def test_compilers_agree(tmp_path: Path) -> None:
     """The asserts hold in C and in C++, and the bytes of a struct are those of its message."""

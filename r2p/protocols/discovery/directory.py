@@ -39,6 +39,7 @@ class TopicInfo(msgspec.Struct):
 
     `types` has the type that the peers in each role (ROLE_...) announce, and `typed_at` the time of the last one.
     These and `fingerprint` are those of the publishers, or of the subscribers while publishers have said nothing.
+    `type_name` is what ROS nodes call the type, `package/Name`; empty on other links.
     """
 
     name: str
@@ -48,6 +49,7 @@ class TopicInfo(msgspec.Struct):
     advertised_at: int | None = None
     requested_at: int | None = None
     mismatch: bool = False
+    type_name: str = ""
     types: dict[int, TopicType] = {}
     typed_at: dict[int, int] = {}
 
