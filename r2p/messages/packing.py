@@ -26,6 +26,7 @@ from r2p.messages.shapes import (
 )
 
 _INLINE_MAX = 1024  # bytes of an array whose elements are arguments of `pack`, one by one
+_SLOTS_MAX = 4096  # values of a class from which on arrays are no longer inlined: Python takes 6 us to compile each
 
 # `encode` catches everything: users put objects of any kind into messages, and any exception when these are checked or
 # packed (OverflowError, AttributeError, one of their own) means that they do not fit.
@@ -165,7 +166,7 @@ class _SourceCode:
         match shape:
             case Nested(inner):
                 return self.add_message(inner.cls, inner.fields, value)
-            case FixedArray(item, count, "tuple") if not item.varies and shape.size <= _INLINE_MAX:
+            case FixedArray(item, count, "tuple") if not item.varies and self._may_inline(shape):
                 return self.add_array(item, count, value)
             case Chars(length):
                 return f"text({self._add_fixed(shape.format, f'chars({value}, {length})')})"
@@ -182,6 +183,9 @@ class _SourceCode:
                 return self._add_view(item, limit, value)
             case _:
                 return self._add_part(shape, value)
+
+    def _may_inline(self, shape: Shape) -> bool:
+        return shape.size <= _INLINE_MAX and self._slot_count < _SLOTS_MAX
 
     def add_array(self, item: Shape, count: int, value: str) -> str:
         local = self.local(value)

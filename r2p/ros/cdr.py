@@ -37,6 +37,7 @@ _START = len(HEADER)
 _PLACES = range(8)
 _COUNT_SIZE = 4
 _INLINE_MAX = 1024  # bytes of an array whose elements are arguments of `pack`, one by one
+_INLINE_ALL_MAX = 4096  # the same in elements of all such arrays of a class: Python takes 20 us to compile each
 _STAMPED = "std_msgs/Header"
 
 _MESSAGE = """
@@ -151,6 +152,7 @@ class _CdrSource:
         self._run: list[tuple[str, int]] = []  # format of an element, and the number of elements
         self._values: list[str] = []
         self._slots: list[str] = []
+        self._inlined = 0  # elements of arrays that are in `_values` and `_slots` one by one
         self._has_nul = False  # behind the text that was written last
         self._count = 0
 
@@ -200,7 +202,8 @@ class _CdrSource:
                 return f"text({self._add_fixed(f'{length}s', f'chars({value}, {length})')})"
             case VariableText(limit):
                 return self._add_wide(value, limit) if is_wide else self._add_text(value, limit)
-            case FixedArray(Scalar() as item, count, "tuple") if shape.size <= _INLINE_MAX:
+            case FixedArray(Scalar() as item, count, "tuple") if self._may_inline(shape):
+                self._inlined += count
                 local = self._local(value)
                 self._writes.append(f"if len({local}) != {count}: raise ValueError")
                 self._run.append((item.format, count))
@@ -210,6 +213,9 @@ class _CdrSource:
                 return self._add_numbers(shape, item, value)
             case FixedArray(item) | VariableArray(item):
                 return self._add_elements(shape, item, value, is_wide=is_wide)
+
+    def _may_inline(self, shape: FixedArray) -> bool:
+        return shape.size <= _INLINE_MAX and self._inlined + shape.count <= _INLINE_ALL_MAX
 
     def _add_fixed(self, format: str, value: str) -> str:
         self._run.append((format, 1))

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import r2p
+from r2p.ros.cdr import cdr
 from r2p.ros.classes import TIMES, RosTypes, definitions_of
 from r2p.ros.definitions import (
     SEPARATOR,
@@ -177,3 +178,16 @@ def test_any_text_is_a_definition_or_an_error(text: str) -> None:
         definition_text("my_msgs/Thing", found)
     except r2p.MessageError:
         pass
+
+
+def test_a_type_with_very_many_values_takes_no_seconds_to_compile() -> None:
+    """A definition of a page means 65 536 values, and Python compiles each name in the code of a class."""
+    cls = RosTypes(2, parse("a_msgs/Wide", "".join(f"float32[256] a{n}\n" for n in range(256)))).load("a_msgs/Wide")
+    message = cls(a0=tuple(map(float, range(256))), a200=(1.5,) * 256)
+    codec = cdr(cls)
+    assert codec.encode(message)[4:] == message.encode()
+    assert codec.decode(codec.encode(message)) == cls.decode(message.encode()) == message
+    assert codec.decode.__code__.co_nlocals < 8000
+    assert r2p.layout(cls).decode.__code__.co_nlocals < 8000
+    with pytest.raises(r2p.MessageError, match=r"Wide\.a200"):
+        codec.encode(cls(a200=(1.0,)))

@@ -14,6 +14,7 @@ from r2p.ros.type_names import type_of_dds
 from r2p.transports.zenoh.link import TokenDebouncer
 
 _GRAPH_S = 0.02  # seconds in which changes of the graph are reported as one
+_GRAPH_TOKEN_S = 50e-6  # the same for each token: a report takes a tenth of that, and so at most a tenth of the time
 _REACH_S = 0.01  # seconds until the next check whether messages reach a subscriber whose token is there
 _REACH_TRIES = 100
 _ALONE_MAX_S = 60.0  # seconds between two looks at other domains: twice as long each time, and at most
@@ -110,7 +111,8 @@ class RmwMatches:
         if token is None:
             return
         if self._graph_timer is None:
-            self._graph_timer = self._session.loop.call_later(_GRAPH_S, self._report_graph)
+            pause = max(_GRAPH_S, len(graph) * _GRAPH_TOKEN_S)
+            self._graph_timer = self._session.loop.call_later(pause, self._report_graph)
         if token.kind == EntityKind.NODE:
             self._check_name(token, there)
         elif there:
