@@ -14,6 +14,7 @@ decoded), and a field marked `WIDE` is a wstring. What comes behind a message is
 
 import functools
 import struct
+from array import array
 from collections.abc import Callable
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -440,9 +441,12 @@ def wide_units(text: str) -> bytes:
 
 
 def wide_text(data: bytes) -> str:
-    """Return the text of UTF-16 units of 4 bytes each."""
-    units = struct.unpack(f"<{len(data) // 4}I", data)
-    return struct.pack(f"<{len(units)}H", *units).decode("utf-16-le")
+    """Return the text of UTF-16 units of 4 bytes each. Raises ValueError."""
+    try:
+        units = array("H", memoryview(data).cast("I"))  # without a Python object for each of them
+    except OverflowError:
+        raise ValueError("a unit of a wstring has more than 16 bits") from None
+    return units.tobytes().decode("utf-16-le")
 
 
 _NAMES: dict[str, Any] = {

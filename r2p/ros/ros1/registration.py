@@ -93,6 +93,8 @@ class MasterSession:
         self._updated: set[tuple[str, str]] = set()
         """Subscriptions whose publishers the master has reported since they were registered."""
         self._tasks: set[asyncio.Task[None]] = set()
+        self._being_checked: set[str] = set()
+        """The nodes of which the master is being asked whether another one has taken the name."""
 
     # What nodes have
 
@@ -369,8 +371,10 @@ class MasterSession:
     def shutdown_asked(self, node: str, caller: str, reason: str) -> None:
         """End a node: its name was taken, or a user wants it."""
         taken = caller == "/master" and _TAKEN in reason
-        if taken and f"[{node}]" not in reason:
-            return  # for an earlier process, whose port this node has now
+        if taken and (f"[{node}]" not in reason or node in self._being_checked):
+            return  # for an earlier process, whose port this node has now; or it is being found out
+        if taken:
+            self._being_checked.add(node)
         end = self._find_taken(node) if taken else self._end_asked(node, f"{caller} asked for it: {reason}")
         task = asyncio.get_running_loop().create_task(end)
         self._tasks.add(task)
@@ -378,8 +382,11 @@ class MasterSession:
 
     async def _find_taken(self, node: str) -> None:
         uri = "an unknown place"
-        with contextlib.suppress(MasterError, *_GONE):
-            uri = await self.master.lookup_node(node, node)
+        try:
+            with contextlib.suppress(MasterError, *_GONE):
+                uri = await self.master.lookup_node(node, node)
+        finally:
+            self._being_checked.discard(node)
         if node in self._nodes and uri != self.slave_uri(node):  # else the master has not said that
             await self._end_taken(node, uri)
 

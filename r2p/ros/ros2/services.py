@@ -276,6 +276,8 @@ class RmwClient:
             done.set_result(None)
         elif reply.ok is None:
             done.set_exception(ServiceError(_error_text(reply)))
+        elif len(reply.ok.payload) > SIZE_MAX:
+            done.set_exception(ServiceError(f"the response has {len(reply.ok.payload)} bytes, more than {SIZE_MAX}"))
         elif self._is_ours(reply.ok.attachment, sequence):
             done.set_result(reply.ok.payload.to_bytes())
         else:

@@ -75,3 +75,20 @@ MULTICALL = st.lists(
 @given(st.lists(CALLS | MULTICALL, max_size=6))
 def test_any_call(calls: list[tuple[str, list[Any]]]) -> None:
     asyncio.run(_ask(calls))
+
+
+async def _flood() -> None:
+    session = MasterSession(RosAddress("http://127.0.0.1:1", "127.0.0.1", "127.0.0.1"), Recorder(), Counter())
+    session.add_node("/one")
+    call = "shutdown", ["/master", "[/one] Reason: new node registered with same name"]
+    for _ in range(100):
+        session._nodes["/one"].handle(*call)
+    assert len(session._tasks) == 1
+    await asyncio.wait(session._tasks)
+    session._nodes["/one"].handle(*call)
+    assert len(session._tasks) == 1
+    await session._close()
+
+
+def test_the_master_is_asked_once_in_a_flood_of_calls_that_end_a_node() -> None:
+    asyncio.run(_flood())

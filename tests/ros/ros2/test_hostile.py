@@ -1,5 +1,8 @@
 """Whatever other programs send by zenoh, nothing raises, and what is of no use is counted."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
 from r2p.ros.ros2.graph import TOKENS_MAX, TokenGraph
@@ -10,6 +13,7 @@ from r2p.ros.ros2.keys import (
     decode_attachment,
     encode_attachment,
 )
+from r2p.ros.ros2.matches import RmwMatches
 from r2p.ros.type_names import dds_type
 from r2p.transports.stats import LoggedCounter
 from tests.ros.ros2.network import STRING, endpoint, joined, router
@@ -103,6 +107,18 @@ async def test_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
         await user.until(lambda: not user.graph.nodes and "gone /accept" in user.events)
         a.advertise(endpoint("/here", "/1st"))
         assert "/1st is not on ROS 2" in user.notices[-1]
+
+
+def test_reports_of_a_large_graph_take_a_part_of_the_time_only() -> None:
+    """Each takes as long as there are tokens, and one token that comes and goes is enough to cause them."""
+    pauses: list[float] = []
+    graph, key = TokenGraph("ab", LoggedCounter()), (TOKEN % 1).split("/", 2)[2]
+    loop = SimpleNamespace(call_later=lambda pause, _: pauses.append(pause))
+    session: Any = SimpleNamespace(graph=graph, loop=loop, user=None, domain=0, own_endpoints=lambda *_: [])
+    RmwMatches(session, lambda _: True, lambda _: None)._on_settled(key, True)
+    graph._tokens |= {str(number): graph._tokens[TOKEN % 1] for number in range(20_000)}
+    RmwMatches(session, lambda _: True, lambda _: None)._on_settled(key, False)
+    assert pauses == [0.02, 1.0]
 
 
 def test_too_many_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
