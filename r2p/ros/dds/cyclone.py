@@ -8,7 +8,6 @@ package cyclonedds; names of types and their hashes are compared all the same.
 Nothing of Cyclone DDS calls into Python: a callback would need the interpreter's lock in the threads that receive.
 """
 
-import contextlib
 import ctypes
 import os
 import threading
@@ -39,7 +38,7 @@ from r2p.ros.middleware import Qos
 BATCH = 64
 """Messages that are taken from a reader at once."""
 _BATCHES = 4  # on their way to the event loop, at most; the rest waits in the readers, as many as they keep
-_DISCOVERED_MAX = 10_000  # changes that are taken at once: all
+_DISCOVERED_MAX = 10_000  # changes that are looked at in one go: all
 _KEPT_MAX = 1000  # messages that a reader without a depth keeps
 _FOREVER: Final = (1 << 63) - 1
 
@@ -127,6 +126,10 @@ class DdsEvents(msgspec.Struct):
     """Own endpoints, and the policy of the quality of service which keeps another one away."""
     samples: list[tuple[int, list[DdsSample]]] = msgspec.field(default_factory=list)
     """Own readers, and what they received."""
+    errors: list[Exception] = msgspec.field(default_factory=list)
+    """Errors of this side."""
+    unreadable: int = 0
+    """Endpoints of others with what this side can't read, such as texts that are not UTF-8."""
 
 
 class Participant:
@@ -257,8 +260,12 @@ class Participant:
         for number in numbers:
             endpoint = self._endpoints.get(number)
             if endpoint is not None:
-                with contextlib.suppress(DDSException):  # it was removed meanwhile
+                try:
                     self._look_at(number, endpoint, events)
+                except DDSException:
+                    pass  # it was removed meanwhile
+                except Exception as error:  # noqa: BLE001 - reported; the thread goes on for all others
+                    events.errors.append(error)
 
     def _look_at(self, number: int, endpoint: "DataReader[Any] | DataWriter[Any]", events: DdsEvents) -> None:
         if isinstance(endpoint, DataWriter):
@@ -280,15 +287,27 @@ class Participant:
             events.samples.append((number, samples))
 
     def _discover(self, reader: BuiltinDataReader, kind: int, events: DdsEvents) -> None:
-        for each in reader.take(_DISCOVERED_MAX):
-            gone = each.sample_info.instance_state != InstanceState.Alive
-            if kind == 0:
-                if gone:
-                    events.lost_participants.append(each.key.bytes)
-            elif gone:
-                events.lost.append(each.key.bytes)
-            elif each.participant_key.bytes != self.gid:
-                events.found.append((_seen(each), kind == 1))
+        """Take what has changed, one by one: what can't be read is left out alone."""
+        for _ in range(_DISCOVERED_MAX):
+            try:
+                taken = reader.take(1)
+                for each in taken:
+                    self._note(each, kind, events)
+            except Exception:  # noqa: BLE001 - counted: whatever the package raises for it
+                events.unreadable += 1
+            else:
+                if not taken:
+                    return
+
+    def _note(self, each: Any, kind: int, events: DdsEvents) -> None:
+        gone = each.sample_info.instance_state != InstanceState.Alive
+        if kind == 0:
+            if gone:
+                events.lost_participants.append(each.key.bytes)
+        elif gone:
+            events.lost.append(each.key.bytes)
+        elif each.participant_key.bytes != self.gid:
+            events.found.append((_seen(each), kind == 1))
 
 
 _READER_EVENTS = DDSStatus.DataAvailable | DDSStatus.SubscriptionMatched | DDSStatus.RequestedIncompatibleQos

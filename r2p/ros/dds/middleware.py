@@ -7,7 +7,8 @@ theirs. A writer without room for a message keeps it here, and tries again; the 
 import asyncio
 import contextlib
 import contextvars
-from collections import Counter, deque
+import threading
+from collections import deque
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -22,6 +23,7 @@ from r2p.ros.dds.names import DISCOVERY, dds_topic, user_data
 from r2p.ros.middleware import Middleware, MiddlewareUser, Qos, RosArrival, RosEndpoint, RosServer, RosService, RosType
 from r2p.ros.type_names import dds_type
 from r2p.runtime.backpressure import LINK_DOWN
+from r2p.transports.stats import LoggedCounter
 from r2p.units import SECOND
 
 RETRY_S = 0.002
@@ -66,9 +68,10 @@ class DdsMiddleware(Middleware):
 
     version = 2
     has_services: ClassVar[bool] = False
+    lost: LoggedCounter
 
     def __init__(self, domain: int, interface: str) -> None:
-        self.lost = Counter()
+        self.lost = LoggedCounter()
         self._place = domain, interface
         self._clock = real_clock()
         self._graph = DdsGraph()
@@ -88,8 +91,7 @@ class DdsMiddleware(Middleware):
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(self._handle, events, context=context)
 
-        participant = await asyncio.to_thread(Participant, *self._place, hand_over)
-        self._participant = participant
+        participant = self._participant = await self._join(hand_over)
         try:
             name = dds_type("rmw_dds_common/ParticipantEntitiesInfo")
             writer = participant.add_writer(DISCOVERY, name, _DISCOVERY_QOS, b"")
@@ -105,6 +107,30 @@ class DdsMiddleware(Middleware):
         finally:
             self._participant = None
             await asyncio.shield(asyncio.to_thread(participant.close))
+
+    async def _join(self, hand_over: Callable[[DdsEvents], None]) -> Participant:
+        """Make the participant, in a thread. One that is there only after a cancellation leaves again."""
+        made: list[Participant] = []
+        lock, given_up = threading.Lock(), threading.Event()
+
+        def make() -> Participant:
+            participant = Participant(*self._place, hand_over)
+            with lock:
+                made.append(participant)
+                unwanted = given_up.is_set()
+            if unwanted:
+                participant.close()
+            return participant
+
+        try:
+            return await asyncio.to_thread(make)
+        except asyncio.CancelledError:
+            with lock:
+                given_up.set()
+                there = list(made)
+            for participant in there:
+                await asyncio.shield(asyncio.to_thread(participant.close))
+            raise
 
     # Nodes and endpoints
 
@@ -244,6 +270,14 @@ class DdsMiddleware(Middleware):
     def _handle(self, events: DdsEvents) -> None:
         if self._participant is None:
             return
+        for error in events.errors:
+            self.lost.internal_error(error)
+        if events.unreadable:
+            self.lost["announcement that can't be read"] += events.unreadable
+        self.lost.guard(self._handle_all, events)
+        self._participant.made_room()
+
+    def _handle_all(self, events: DdsEvents) -> None:
         changed = bool(events.found or events.lost or events.lost_participants)
         self._discovered(events)
         for number, samples in events.samples:
@@ -261,7 +295,6 @@ class DdsMiddleware(Middleware):
         arrivals = self._arrivals(events)
         if arrivals:
             self._user.received(arrivals)
-        self._participant.made_room()
 
     def _arrivals(self, events: DdsEvents) -> list[RosArrival]:
         arrivals = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
+import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -13,13 +14,14 @@ import r2p
 from r2p.clock import SystemClock
 from r2p.errors import ServiceError, TransportError
 from r2p.msg import String
-from r2p.ros.middleware import Qos, RosEndpoint, RosServer, RosService, RosType
+from r2p.ros.middleware import Qos, RosArrival, RosEndpoint, RosServer, RosService, RosType
 from r2p.testing.network import node_in
 from r2p.transports.url import open_transport
 from tests.ros.ros1.recorder import Recorder
 
 pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheels for this computer: no test of dds:")
 
+from r2p.ros.dds.cyclone import DdsEvents, Participant
 from r2p.ros.dds.middleware import SLOW, DdsMiddleware
 
 if TYPE_CHECKING:
@@ -188,3 +190,64 @@ async def test_the_environment_of_ros_counts(monkeypatch: pytest.MonkeyPatch, do
     with pytest.raises(TransportError, match="ROS_DOMAIN_ID=x: a domain of ROS is a number"):
         open_transport("dds:")
     open_transport("dds:?domain=3")  # what the URL says does not need it
+
+
+async def test_a_link_that_ends_while_it_joins_leaves_no_participant(
+    domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cyclone DDS takes a while to join: what is there only afterwards would be on the network for good."""
+    events: list[str] = []
+    began, go, closed = threading.Event(), threading.Event(), threading.Event()
+
+    class Slow:
+        def __init__(self, *_place: object) -> None:
+            began.set()
+            go.wait(30)
+            events.append("joined")
+
+        def close(self) -> None:
+            events.append("closed")
+            closed.set()
+
+    monkeypatch.setattr("r2p.ros.dds.middleware.Participant", Slow)
+    running = asyncio.create_task(DdsMiddleware(domain, "lo").run(Recorder(), lambda: None))
+    await asyncio.to_thread(began.wait, 30)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    go.set()
+    assert await asyncio.to_thread(closed.wait, 30)
+    assert events == ["joined", "closed"]
+
+
+@pytest.mark.internal_errors
+async def test_what_can_not_be_read_and_errors_of_users_do_not_end_the_rest(
+    domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One peer whose announcement has what is not text; and a user that raises, more often than may wait."""
+    noted = Participant._note
+
+    def note(self: Participant, each: Any, kind: int, events: DdsEvents) -> None:
+        if getattr(each, "topic_name", "") == "rt/bad":
+            raise UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")
+        noted(self, each, kind, events)
+
+    monkeypatch.setattr(Participant, "_note", note)
+    async with participant(domain) as (sender, sends), participant(domain) as (receiver, receives):
+        receiver.subscribe(endpoint("/good", "/b", depth=0))
+        sender.advertise(endpoint("/bad"))
+        sender.advertise(endpoint("/good", depth=0))
+        await sends.until(lambda: ("subscriber joined", "/good") in sends.log)
+        await receives.until(lambda: found(receives))
+        heard: list[bytes] = []
+
+        def fail(messages: list[RosArrival]) -> None:
+            heard.extend(each.data for each in messages)
+            receives.note("heard")
+            raise ZeroDivisionError
+
+        monkeypatch.setattr(receives, "received", fail)
+        for number in range(20):
+            sender.publish("/a", "/good", text(number), 0)
+            await receives.until(lambda: heard[-1:] == [text(number)])  # noqa: B023 - awaited here
+        assert receiver.lost["announcement that can't be read"] >= 1
+        assert receiver.lost["internal error"] == 20

@@ -80,7 +80,7 @@ def test_any_call(calls: list[tuple[str, list[Any]]]) -> None:
 async def _flood() -> None:
     session = MasterSession(RosAddress("http://127.0.0.1:1", "127.0.0.1", "127.0.0.1"), Recorder(), Counter())
     session.add_node("/one")
-    call = "shutdown", ["/master", "[/one] Reason: new node registered with same name"]
+    call: tuple[str, list[Any]] = "shutdown", ["/master", "[/one] Reason: new node registered with same name"]
     for _ in range(100):
         session._nodes["/one"].handle(*call)
     assert len(session._tasks) == 1
