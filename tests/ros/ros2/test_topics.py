@@ -1,13 +1,18 @@
 """Topics between two links, and between a link and a bare zenoh session that does what rmw_zenoh does."""
 
+import asyncio
 from functools import partial
 
 import msgspec
 import pytest
+import zenoh
+import zenoh.ext
 
 from r2p.ros.middleware import RosPeerEndpoint, RosType
-from r2p.ros.ros2.keys import NO_HASH
+from r2p.ros.ros2.keys import NO_HASH, data_key, encode_attachment
+from r2p.ros.type_names import dds_type
 from tests.ros.ros2.network import STRING, Recorder, endpoint, joined, router
+from tests.ros.ros2.recorded import recorded
 
 pytestmark = pytest.mark.anyio
 HELLO = b"\x00\x01\x00\x00\x03\x00\x00\x00hi\x00"
@@ -220,3 +225,41 @@ async def test_a_change_of_qos_loses_and_repeats_nothing() -> None:
         b.subscribe(endpoint("/b", transient_local=True))  # later: it is a new one, which gets the latched value
         await user_b.until(lambda: len(user_b.arrivals) == 4)
         assert user_b.arrivals[3].data == b"3"
+
+
+async def test_recorded_history() -> None:
+    """A late subscriber gets what a publisher of another program keeps, with two differences from the SDK's.
+
+    It gets as many messages as its depth says, and not the last one alone; and it asks a publisher that has declared no
+    token, too. A volatile one gets none.
+    """
+    for case in recorded()["transient_local"]:
+        durability, history = case["subscriber_qos"].split(":")[1:3]
+        depth = 0 if history.startswith("2") else int(history.split(",")[1])
+        wanted = endpoint("/late", "/latched", transient_local=bool(durability), depth=depth)
+        key = data_key(0, "/latched", dds_type(STRING.name), STRING.checksum)
+        async with router() as network, joined(network, "/late") as (b, user_b):
+            with network.plain_session() as session:
+                publisher = zenoh.ext.declare_advanced_publisher(
+                    session, key, cache=zenoh.ext.CacheConfig(max_samples=3), publisher_detection=True
+                )
+                token = case["publisher_token"] and session.liveliness().declare_token(case["publisher_token"])
+                for number in range(5):
+                    publisher.put(b"v%d" % number, attachment=encode_attachment(number + 1, 0, bytes(16)))
+                await asyncio.to_thread(lambda: [*session.get("none")])  # now the router has all of them
+                b.subscribe(wanted)
+                kept = [b"v2", b"v3", b"v4"][-(depth or 3) :] if durability else []
+                await user_b.until(partial(has, user_b, len(kept)))
+                with session.declare_publisher(key) as live:
+                    await user_b.until(lambda: live.matching_status)
+                    live.put(b"end", attachment=encode_attachment(9, 0, bytes(range(16))))
+                    await user_b.until(lambda: user_b.arrivals and user_b.arrivals[-1].data == b"end")
+                assert [each.data for each in user_b.arrivals[:-1]] == kept, case["note"]
+                assert {each.encode() for each in case["delivered"]} <= set(kept)
+                if token:
+                    token.undeclare()
+                publisher.undeclare()
+
+
+def has(user: Recorder, count: int) -> bool:
+    return len(user.arrivals) >= count
