@@ -105,6 +105,12 @@ class Recorder(MiddlewareUser):
     def shut_down(self, node: str, reason: str) -> None: ...
 
 
+def matches(sender: zenoh.Publisher | zenoh.Querier) -> bool:
+    """Whether a receiver is known: the stubs promise a bool, but it is an object, which is always true."""
+    status: object = sender.matching_status
+    return bool(getattr(status, "matching", status))
+
+
 class RouterOfTests:
     """A zenoh router on a free port, which can be stopped and started again."""
 

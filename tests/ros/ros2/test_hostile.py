@@ -16,7 +16,7 @@ from r2p.ros.ros2.keys import (
 from r2p.ros.ros2.matches import RmwMatches
 from r2p.ros.type_names import dds_type
 from r2p.transports.stats import LoggedCounter
-from tests.ros.ros2.network import STRING, endpoint, joined, router
+from tests.ros.ros2.network import STRING, endpoint, joined, matches, router
 from tests.ros.ros2.recorded import SESSION, recorded
 
 KEY = data_key(0, "/accept", dds_type(STRING.name), STRING.checksum)
@@ -37,7 +37,7 @@ async def test_recorded_messages() -> None:
         a.subscribe(endpoint("/here", "/accept"))
         with network.plain_session() as session:
             publisher = session.declare_publisher(KEY)
-            await user.until(lambda: publisher.matching_status)
+            await user.until(lambda: matches(publisher))
             for case in recorded()["subscriber_accepts"]:
                 header = None if case["attachment"] is None else bytes.fromhex(case["attachment"])
                 if case["payload"] is None:
@@ -67,7 +67,7 @@ async def test_publishers_that_share_a_gid_that_is_none(gid: bytes) -> None:
         a.subscribe(endpoint("/here", "/accept", transient_local=True, depth=10))
         with network.plain_session() as session:
             publisher = session.declare_publisher(KEY)
-            await user.until(lambda: publisher.matching_status)
+            await user.until(lambda: matches(publisher))
             for number in (1, 2, 3, 1, 2, 9):
                 publisher.put(b"%d" % number, attachment=ATTACHMENT.pack(number, 0, len(gid), gid)[: 17 + len(gid)])
             await user.until(lambda: len(user.arrivals) == 6)

@@ -13,7 +13,7 @@ from r2p.ros.middleware import RosPeerServer, RosService
 from r2p.ros.ros2.keys import NO_HASH, data_key, decode_attachment, encode_attachment
 from r2p.ros.ros2.middleware import Ros2Middleware
 from r2p.ros.type_names import dds_type
-from tests.ros.ros2.network import SET_BOOL, Recorder, RouterOfTests, endpoint, joined, router, server
+from tests.ros.ros2.network import SET_BOOL, Recorder, RouterOfTests, endpoint, joined, matches, router, server
 from tests.ros.ros2.recorded import recorded
 
 pytestmark = pytest.mark.anyio
@@ -89,7 +89,7 @@ async def served(network: RouterOfTests) -> AsyncIterator[tuple[Any, Recorder, z
     async with joined(network, "/server") as (a, user_a):
         a.serve(server("/server"))
         with network.plain_session() as session, session.declare_querier(KEY) as querier:
-            await user_a.until(lambda: querier.matching_status)
+            await user_a.until(lambda: matches(querier))
             yield a, user_a, session
 
 

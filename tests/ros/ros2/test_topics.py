@@ -11,7 +11,7 @@ import zenoh.ext
 from r2p.ros.middleware import RosPeerEndpoint, RosType
 from r2p.ros.ros2.keys import NO_HASH, data_key, encode_attachment
 from r2p.ros.type_names import dds_type
-from tests.ros.ros2.network import STRING, Recorder, endpoint, joined, router
+from tests.ros.ros2.network import STRING, Recorder, endpoint, joined, matches, router
 from tests.ros.ros2.recorded import recorded
 
 pytestmark = pytest.mark.anyio
@@ -251,7 +251,7 @@ async def test_recorded_history() -> None:
                 kept = [b"v2", b"v3", b"v4"][-(depth or 3) :] if durability else []
                 await user_b.until(partial(has, user_b, len(kept)))
                 with session.declare_publisher(key) as live:
-                    await user_b.until(lambda: live.matching_status)
+                    await user_b.until(lambda: matches(live))
                     live.put(b"end", attachment=encode_attachment(9, 0, bytes(range(16))))
                     await user_b.until(lambda: user_b.arrivals and user_b.arrivals[-1].data == b"end")
                 assert [each.data for each in user_b.arrivals[:-1]] == kept, case["note"]
