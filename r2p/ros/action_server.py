@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeAlias
 
+from r2p.clock import clock_of
 from r2p.errors import Error, MessageError
 from r2p.log_lines import LineLimit
 from r2p.messages import Timestamp, layout
@@ -70,7 +71,7 @@ class ServerGoal(Generic[G, R, F]):
         """False as long as clients may not cancel the goal: the handler sets it."""
         self.ended = asyncio.Event()
         """Set once the goal has ended."""
-        self.ended_at = 0.0
+        self.ended_at = 0  # monotonic ns
         self.result: R | None = None
         """The result, when the goal has ended."""
         self.task: asyncio.Task[None] | None = None
@@ -137,6 +138,7 @@ class ActionServer(HandlerOwner, Generic[G, R, F]):
         self._check = check
         self._preempt = preempt
         self._loop = asyncio.get_running_loop()
+        self._clock = clock_of(self._loop)
         self._waiting: deque[ServerGoal[G, R, F]] = deque()
         self._ending = ""
         self._closed = False
@@ -287,7 +289,7 @@ class ActionServer(HandlerOwner, Generic[G, R, F]):
     def _end(self, goal: ServerGoal[G, R, F], state: GoalState, result: Any) -> None:
         kind = self.types.result
         goal.result = result if result.__class__ is kind else layout(kind).zero
-        goal.ended_at = self._loop.time()
+        goal.ended_at = self._clock.monotonic()
         goal.ended.set()
         self._set_state(goal, state)
         if goal in self._waiting:
@@ -311,9 +313,9 @@ class ActionServer(HandlerOwner, Generic[G, R, F]):
 
     def _forget_old(self) -> None:
         """Forget goals that ended long ago, or too many of them."""
-        now, ended = self._loop.time(), [each for each in self.goals.values() if each.ended.is_set()]
+        now, ended = self._clock.monotonic(), [each for each in self.goals.values() if each.ended.is_set()]
         for place, goal in enumerate(reversed(ended)):
-            if place >= _RESULTS_MAX or now - goal.ended_at > RESULT_KEPT:
+            if place >= _RESULTS_MAX or now - goal.ended_at > RESULT_KEPT * SECOND:
                 del self.goals[goal.id]
 
     # Cancellation and results
@@ -365,7 +367,7 @@ class ActionServer(HandlerOwner, Generic[G, R, F]):
 
     def _log(self, level: int, kind: str, text: str, error: Exception | None = None) -> None:
         """Log what any client can cause any number of times a second."""
-        suffix = self._log_limit.suffix(kind, int(self._loop.time() * SECOND))
+        suffix = self._log_limit.suffix(kind, self._clock.monotonic())
         if suffix is not None:
             self._node.log.log(level, "action %s: %s%s", self.name, text, suffix, exc_info=error)
 

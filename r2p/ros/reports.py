@@ -4,7 +4,7 @@ A node has the name that it has in ROS: `/node` if it is of this module, else `/
 writes `MODULE.node` in its logs. Names longer than 7 (module) or 8 (node) characters are aliases, as in r2p's record.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from r2p.errors import MessageError
@@ -85,26 +85,27 @@ def owner_of(name: str, namespace: str = "") -> tuple[str, str]:
 # Diagnostics
 
 
-class _Diagnostics:
-    """Makes a DiagnosticArray of one status."""
+Report = Callable[[int, Source, int, str, str, dict[str, str]], Sequence[Message]]
+"""Returns the message of one status: its time (ns), source, level and name, which comes behind that of the module; a
+text, and the values as details.
+"""
 
-    def __init__(self, parts: RosParts) -> None:
-        self._array = parts.theirs
-        self._status = parts.cls("diagnostic_msgs/DiagnosticStatus")
-        self._value = parts.cls("diagnostic_msgs/KeyValue")
 
-    def report(
-        self, ns: int, source: Source, level: int, name: str, text: str, values: dict[str, str]
-    ) -> Sequence[Message]:
-        """Return the message; `name` comes behind that of the module, and `values` are the details."""
-        made = self._status(
+def _diagnostics(parts: RosParts) -> Report:
+    """Return what makes a DiagnosticArray of one status."""
+    status, value = parts.cls("diagnostic_msgs/DiagnosticStatus"), parts.cls("diagnostic_msgs/KeyValue")
+
+    def report(ns: int, source: Source, level: int, name: str, text: str, values: dict[str, str]) -> Sequence[Message]:
+        made = status(
             level=level,
             name=f"{source.module}: {name}",
             message=text,
             hardware_id=source.module,
-            values=tuple(self._value(key=key, value=value) for key, value in values.items()),
+            values=tuple(value(key=key, value=each) for key, each in values.items()),
         )
-        return (self._array(header=header(ns, ""), status=(made,)),)
+        return (parts.theirs(header=header(ns, ""), status=(made,)),)
+
+    return report
 
 
 def _from_diagnostics(parts: RosParts) -> FromRos:
@@ -116,22 +117,22 @@ def _from_diagnostics(parts: RosParts) -> FromRos:
 
 def gateway_status(parts: RosParts) -> Functions:
     """Convert GatewayStatus to diagnostics: of a link, or of a topic on its way between two of them."""
-    diagnostics = _Diagnostics(parts)
+    report = _diagnostics(parts)
 
     def to_ros(status: Any, ns: int, source: Source) -> Sequence[Message]:
         counts = {"forwarded": str(status.forwarded), "dropped": str(status.dropped), "rate": f"{status.rate:g} 1/s"}
         if not status.topic:
             level = _LINK_LEVELS.get(status.state, _OK)
-            return diagnostics.report(ns, source, level, f"link {status.source}", status.state, counts)
+            return report(ns, source, level, f"link {status.source}", status.state, counts)
         way = f"{status.topic} from {status.source} to {status.target}"
-        return diagnostics.report(ns, source, _OK, way, "forwarded", counts)
+        return report(ns, source, _OK, way, "forwarded", counts)
 
     return to_ros, _from_diagnostics(parts)
 
 
 def power_event(parts: RosParts) -> Functions:
     """Convert PowerEvent to diagnostics."""
-    diagnostics = _Diagnostics(parts)
+    report = _diagnostics(parts)
     thresholds = {
         PowerEvent.LOW_VOLTAGE: "low voltage",
         PowerEvent.HIGH_VOLTAGE: "high voltage",
@@ -142,24 +143,24 @@ def power_event(parts: RosParts) -> Functions:
         beyond = ", ".join(name for bit, name in thresholds.items() if event.exceeded & bit)
         values = {"voltage": f"{event.voltage / 1000:g} V", "current": f"{event.current / 1000:g} A"}
         level = _ERROR if event.exceeded else _OK
-        return diagnostics.report(ns, source, level, "power supply", beyond or "within its thresholds", values)
+        return report(ns, source, level, "power supply", beyond or "within its thresholds", values)
 
     return to_ros, _from_diagnostics(parts)
 
 
 def bus_traffic(parts: RosParts) -> Functions:
     """Convert BusTraffic to diagnostics: of a bus, or of a topic's frames on it."""
-    diagnostics = _Diagnostics(parts)
+    report = _diagnostics(parts)
 
     def to_ros(traffic: Any, ns: int, source: Source) -> Sequence[Message]:
         values = {"share": f"{traffic.share:.1%}", "frames": f"{traffic.frames:g} 1/s"}
         if traffic.kind != "total":
             name = f"{traffic.topic or traffic.kind} of {traffic.module or '?'} on {traffic.bus}"
-            return diagnostics.report(ns, source, _OK, name, traffic.kind, values)
+            return report(ns, source, _OK, name, traffic.kind, values)
         values |= {"errors": str(traffic.errors), "reserved": f"{traffic.reserved:.1%}"}
         values["used of the rest"] = f"{traffic.free_used:.1%}"
         level = _WARN if traffic.free_used > _BUSY else _OK
         text = "events wait long" if level else f"{traffic.share:.0%} used"
-        return diagnostics.report(ns, source, level, traffic.bus, text, values)
+        return report(ns, source, level, traffic.bus, text, values)
 
     return to_ros, _from_diagnostics(parts)

@@ -129,10 +129,10 @@ class TopicTypes:
     def _same(self, cls: type[Message], theirs: type[Message], kind: RosType) -> RosTopic:
         """Return how a class travels as a type with the same fields."""
         shape = layout(cls)
-        stamps = _HeaderStamps(shape, self._counts) if _has_header(shape) else None
+        fill = _header_stamps(shape, self._counts) if _has_header(shape) else None
         if self.version == 1:
-            return RosTopic(shape, kind, _packed(shape, stamps), _unpacked(shape))
-        return RosTopic(shape, kind, _to_cdr(theirs, stamps), _from_cdr(shape, theirs))
+            return RosTopic(shape, kind, _packed(shape, fill), _unpacked(shape))
+        return RosTopic(shape, kind, _to_cdr(theirs, fill), _from_cdr(shape, theirs))
 
     def _converted(self, found: Conversion) -> RosTopic:
         shape, stamps = layout(found.ours), StampSource(found.ours, self._counts)
@@ -184,31 +184,33 @@ def _has_header(shape: Layout[Any]) -> bool:
     return header is not None and getattr(getattr(header, "layout", None), "name", "") == "std_msgs/Header"
 
 
-class _HeaderStamps:
-    """Fills `header.stamp` of messages that have none of their own, or one of another clock."""
+Fill = Callable[[Sample], Message | None]
+"""Returns the message of a sample with its stamp in the header; None if the bytes of the sample have it already."""
 
-    def __init__(self, shape: Layout[Any], counts: Counter[str]) -> None:
-        self._shape = shape
-        self._source = StampSource(shape.cls, counts)
 
-    def filled(self, sample: Sample) -> Any:
-        """Return the message with its stamp; None if the bytes of the sample have it already."""
-        found = self._source.find(sample)
-        if found == self._source.own(sample.data):
+def _header_stamps(shape: Layout[Any], counts: Counter[str]) -> Fill:
+    """Return what fills `header.stamp` of messages that have none of their own, or one of another clock."""
+    source = StampSource(shape.cls, counts)
+
+    def fill(sample: Sample) -> Any:
+        found = source.find(sample)
+        if found == source.own(sample.data):
             return None
         message: Any = sample.message
         if message is None:
-            message = self._shape.decode(sample.data)
+            message = shape.decode(sample.data)
         header = msgspec.structs.replace(message.header, stamp=Timestamp.from_ns(found))
         return msgspec.structs.replace(message, header=header)
 
+    return fill
 
-def _packed(shape: Layout[Any], stamps: _HeaderStamps | None) -> Callable[[Sample], Sequence[bytes]]:
+
+def _packed(shape: Layout[Any], fill: Fill | None) -> Callable[[Sample], Sequence[bytes]]:
     if shape.exact_size:  # it has no header with a stamp: there is a text in that
         return _fixed(b"", shape.exact_size)
 
     def encode(sample: Sample) -> Sequence[bytes]:
-        message = None if stamps is None else stamps.filled(sample)
+        message = None if fill is None else fill(sample)
         return (sample.data if message is None else message.encode(),)
 
     return encode
@@ -238,13 +240,13 @@ def _unpacked(shape: Layout[Any]) -> Callable[[bytes], Decoded]:
     return decode if size or stamps.read is not None else lambda data: (data, None, 0)
 
 
-def _to_cdr(theirs: type[Message], stamps: _HeaderStamps | None) -> Callable[[Sample], Sequence[bytes]]:
+def _to_cdr(theirs: type[Message], fill: Fill | None) -> Callable[[Sample], Sequence[bytes]]:
     pack, decode = cdr(theirs).encode, layout(theirs).decode
     if size := packed_size(theirs):  # it has no header with a stamp: there is a text in that
         return _fixed(HEADER, size)
 
     def encode(sample: Sample) -> Sequence[bytes]:
-        filled = None if stamps is None else stamps.filled(sample)
+        filled = None if fill is None else fill(sample)
         message = sample.message if filled is None else filled
         if type(message) is not theirs:
             message = decode(sample.data if filled is None else filled.encode())

@@ -147,14 +147,26 @@ def test_version() -> None:
     assert re.fullmatch(r"r2p \d+\.\d+\.\d+\n", CliRunner().invoke(app, ["--version"]).output)
 
 
-@pytest.mark.processes
-def test_help_loads_no_command_and_no_library_that_it_does_not_need() -> None:
+def _loaded(*arguments: str) -> set[str]:
+    """Return the modules that a command has imported at its end."""
     program = (
         "import contextlib, sys; from r2p.tools.main import app\n"
-        "with contextlib.suppress(SystemExit): app(['--help'])\n"
+        f"with contextlib.suppress(SystemExit): app({arguments!r})\n"
         "print('loaded', *sys.modules)"
     )
     text = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    loaded = set(text.partition("loaded ")[2].split())
+    return set(text.partition("loaded ")[2].split())
+
+
+@pytest.mark.processes
+def test_help_loads_no_command_and_no_library_that_it_does_not_need() -> None:
+    loaded = _loaded("--help")
     assert "r2p.tools.main" in loaded
     assert not loaded & {"yaml", "rich", "serial", "r2p.tools.session", "r2p.tools.topic", "r2p.tools.run"}
+
+
+@pytest.mark.processes
+def test_commands_on_other_links_load_nothing_of_ros() -> None:
+    loaded = _loaded("topic", "echo", "leds", "--via", "tcp-listen:0", "--timeout", "10ms")
+    assert "r2p.transports.tcp" in loaded
+    assert not [each for each in loaded if each.startswith("r2p.ros")]

@@ -89,17 +89,9 @@ class MasterClient:
         """Return the types of all topics that were ever registered; `*`: it had only subscribers of any type."""
         return _pairs(await self.call("getTopicTypes", node))
 
-    async def get_published_topics(self, node: str, namespace: str = "") -> dict[str, str]:
-        """Return the topics that have publishers, in a namespace or all, with their types."""
-        return _pairs(await self.call("getPublishedTopics", node, namespace))
-
     async def get_pid(self, node: str) -> int:
         """Return the process of the master: another one has no registrations."""
         return _number(await self.call("getPid", node))
-
-    async def get_uri(self, node: str) -> str:
-        """Return the URI by which the master calls itself."""
-        return str(await self.call("getUri", node))
 
     # The parameter server
 
@@ -111,21 +103,9 @@ class MasterClient:
         """Set a parameter; a dict replaces all of a namespace."""
         await self.call("setParam", node, key, value)
 
-    async def has_param(self, node: str, key: str) -> bool:
-        """Return whether a parameter is set."""
-        return bool(await self.call("hasParam", node, key))
-
     async def delete_param(self, node: str, key: str) -> None:
         """Delete a parameter, or all in a namespace. Raises MasterError if it is not set."""
         await self.call("deleteParam", node, key)
-
-    async def search_param(self, node: str, key: str) -> str:
-        """Return the full name of a parameter that is nearest upwards from the node. Raises MasterError if none is."""
-        return str(await self.call("searchParam", node, key))
-
-    async def get_param_names(self, node: str) -> list[str]:
-        """Return the full names of all parameters."""
-        return _texts(await self.call("getParamNames", node))
 
     async def subscribe_param(self, node: str, api: str, key: str) -> Value:
         """Have changes of a parameter, or in a namespace, sent to a slave; return its value, `{}` if it is not set."""

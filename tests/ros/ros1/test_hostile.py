@@ -40,7 +40,7 @@ async def _call(answer: Any) -> None:
     for call in METHODS.values():
         count = call.__code__.co_argcount - 1 - len(call.__defaults__ or ())
         with contextlib.suppress(MasterError, XmlRpcError):
-            await call(client, *["/one"] * count)  # type: ignore[operator]
+            await call(client, *["/one"] * count)
     with contextlib.suppress(XmlRpcError):
         host, port = await request_topic(Answering(answer), "http://there:1/", "/one", "/chat", 1.0)
         assert (host.isprintable(), 0 < port < 65536) == (True, True)
