@@ -37,6 +37,7 @@ ELSEWHERE = {
     },
     ("r2p/transports/can/socketcan.py", "kind"): _ERROR_FRAMES,
     ("r2p/protocols/rtcan/engine.py", "fate.value"): _FATES | {Fate.DISCARDED.value},
+    ("r2p/ros/registrations.py", "f'{self._what}not on ROS'"): {"not on ROS", "service not on ROS"},
     ("r2p/transports/rtcan/tx.py", "done.fate.value"): _FATES,
     ("r2p/transports/guard.py", "verdict.value"): {
         Verdict.NO_KEY.value,
