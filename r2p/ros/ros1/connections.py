@@ -28,6 +28,10 @@ CONNECTIONS_MAX = 1000
 place of the one that has waited for longest.
 """
 
+_HEADER_MAX = (
+    256 << 10
+)  # bytes of the header of one that connects: the text of its type, at most, and there may be many
+
 _IDLE_S = 10  # seconds without traffic until the kernel probes the other side: rospy waits 60
 _INTERVAL_S = 2  # seconds between two of these probes
 _PROBES = 5  # unanswered probes until the connection counts as lost
@@ -213,6 +217,7 @@ class _IncomingConnection(TcprosConnection):
 
     def __init__(self, listener: "TcprosListener") -> None:
         super().__init__(listener.context)
+        self.reader.limit = _HEADER_MAX
         self._listener = listener
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:

@@ -227,6 +227,15 @@ async def test_thousands_of_requests_in_one_piece_are_answered_while_the_caller_
     assert len(node.user.requests) == 6001  # those that wait are refused, and not handled
 
 
+async def test_connections_without_a_header_hold_little() -> None:
+    node = Node()
+    wire = node.connect((256 << 10).to_bytes(4, "little") + bytes(1000))
+    assert not wire.closed
+    wire = node.connect(((256 << 10) + 1).to_bytes(4, "little"))
+    assert b"its header is not one of TCPROS: 262145 bytes are announced" in wire.sent()
+    assert wire.closed
+
+
 async def test_connections_over_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Connections that send no header keep out no other one, and subscribers and callers are not without a limit."""
     monkeypatch.setattr("r2p.ros.ros1.connections.CONNECTIONS_MAX", 2)
