@@ -129,6 +129,13 @@ class TypeDescriptions:
         return {"type_name": name, "fields": fields}
 
 
+def service_hash(name: str, request: Fields, response: Fields, definitions: Definitions) -> str:
+    """Return the hash of a service with these fields; `definitions` has those of the types in it."""
+    types, name = TypeDescriptions(definitions), ros2_name(name, "srv")
+    types.add_service(name, request, response)
+    return types.hash(name)
+
+
 def _members(**types: str) -> Fields:
     return tuple(FieldDefinition(name, FieldType(base)) for name, base in types.items())
 

@@ -23,7 +23,7 @@ from r2p.parameters.definition import ParameterInfo
 from r2p.ros.cdr import CdrCodec, cdr
 from r2p.ros.classes import RosTypes
 from r2p.ros.definitions import MessageDefinition, parse, parse_service
-from r2p.ros.hashes import TypeDescriptions
+from r2p.ros.hashes import TypeDescriptions, service_hash
 from r2p.ros.middleware import RosService, RosType
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING, BYTES, BOOLS, INTEGERS, DOUBLES, STRINGS = range(10)
@@ -132,16 +132,14 @@ def message_class(name: str) -> type[Message]:
 
 
 @functools.cache
-def service(name: str) -> ParameterService:
+def service(last: str) -> ParameterService:
     """Return a service by the last part of its name: "get_parameters"."""
-    kind = SERVICE_NAMES[name]
+    kind = SERVICE_NAMES[last]
     request, response = _service_parts(kind)
-    types, full = TypeDescriptions(_definitions()), f"{_PACKAGE}/srv/{kind}"
-    types.add_service(full, request.fields, response.fields)
+    name = f"{_PACKAGE}/{kind}"
+    checksum = service_hash(name, request.fields, response.fields, _definitions())
     classes = [_types().load(part.name) for part in (request, response)]
-    return ParameterService(
-        RosService(f"{_PACKAGE}/{kind}", types.hash(full)), cdr(classes[0]), cdr(classes[1]), classes[1]
-    )
+    return ParameterService(RosService(name, checksum), cdr(classes[0]), cdr(classes[1]), classes[1])
 
 
 @functools.cache

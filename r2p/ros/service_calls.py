@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from r2p.clock import Alarm, Clock
+from r2p.clock import Alarm, clock_of
 from r2p.codecs import services
 from r2p.codecs.services import HEADER_SIZE, NUMBERS, REQUESTS, RESPONSES, TEXT_MIN, Kind, ServiceHeader
 from r2p.errors import DecodeError, Error, MessageError
@@ -89,14 +89,13 @@ class RosCalls:
         self,
         middleware: Middleware,
         loop: asyncio.AbstractEventLoop,
-        clock: Clock,
         send: Send,
         report: Callable[[CarriedService, str], None],
         lost: Counter[str],
     ) -> None:
         self._middleware = middleware
         self._loop = loop
-        self._clock = clock
+        self._clock = clock_of(loop)
         self._send = send
         self._report = report
         self._lost = lost
@@ -197,12 +196,10 @@ class RosRequests:
     `instance` stands for all ROS nodes in the headers: each server remembers what it has answered to it.
     """
 
-    def __init__(
-        self, instance: int, loop: asyncio.AbstractEventLoop, clock: Clock, send: Send, lost: Counter[str]
-    ) -> None:
+    def __init__(self, instance: int, loop: asyncio.AbstractEventLoop, send: Send, lost: Counter[str]) -> None:
         self.instance = instance
         self._lost = lost
-        self._clock = clock
+        self._clock = clock_of(loop)
         self._send = send
         self._open: dict[tuple[str, int], _OpenRequest] = {}
         self._last = 0

@@ -20,7 +20,7 @@ from r2p.messages import Layout, Message, Nested, layout, show
 from r2p.ros.action_types import with_names
 from r2p.ros.cdr import cdr
 from r2p.ros.definitions import service_md5
-from r2p.ros.hashes import TypeDescriptions
+from r2p.ros.hashes import service_hash
 from r2p.ros.library import definitions_with_those_of_ros
 from r2p.ros.middleware import RosService
 from r2p.ros.type_names import ros2_name
@@ -76,9 +76,8 @@ def service_type(shape: ServiceShape, version: int) -> RosService:
     found = definitions_with_those_of_ros(request.cls, version) | definitions_with_those_of_ros(response.cls, version)
     if version == 1:
         return RosService(shape.name, service_md5(request.name, response.name, found))
-    types, full_name = TypeDescriptions(found), ros2_name(shape.name, "srv")
-    types.add_service(full_name, found[request.name].fields, found[response.name].fields)
-    return RosService(shape.name, types.hash(full_name))
+    fields = found[request.name].fields, found[response.name].fields
+    return RosService(shape.name, service_hash(shape.name, *fields, found))
 
 
 # Bytes

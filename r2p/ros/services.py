@@ -88,11 +88,10 @@ class RosServices:
         self._space = hub.space
         self._discovery = discovery
         self._registrations = registrations
-        loop, clock = hub.space.loop, hub.space.clock
-        lost = discovery.counts
+        loop, lost = hub.space.loop, discovery.counts
         self.not_on_ros = NotOnRos("service ", loop, lost, link.notice)
-        self._calls = RosCalls(link.middleware, loop, clock, self._deliver, self._report, lost)
-        self._requests = RosRequests(hub.random.getrandbits(32) | 1, loop, clock, self._deliver, lost)
+        self._calls = RosCalls(link.middleware, loop, self._deliver, self._report, lost)
+        self._requests = RosRequests(hub.random.getrandbits(32) | 1, loop, self._deliver, lost)
         self._carried: dict[str, CarriedService] = {}
         self._by_ros_name: dict[str, CarriedService] = {}
         self._graph = RosGraph()

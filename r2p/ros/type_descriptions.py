@@ -24,7 +24,7 @@ from r2p.ros.definitions import (
     parse_service,
     plain_text,
 )
-from r2p.ros.hashes import TypeDescriptions, field_type
+from r2p.ros.hashes import TypeDescriptions, field_type, service_hash
 from r2p.ros.library import definitions_with_those_of_ros
 from r2p.ros.middleware import Middleware, RosPeerEndpoint, RosService
 from r2p.ros.type_names import ros2_name, short_name
@@ -78,9 +78,8 @@ def _class(name: str) -> type[Message]:
 def service() -> RosService:
     """Return the type of the service."""
     found, name = _definitions(), f"{_PACKAGE}/GetTypeDescription"
-    types, full = TypeDescriptions(found), ros2_name(name, "srv")
-    types.add_service(full, found[f"{name}_Request"].fields, found[f"{name}_Response"].fields)
-    return RosService(name, types.hash(full))
+    request, response = found[f"{name}_Request"], found[f"{name}_Response"]
+    return RosService(name, service_hash(name, request.fields, response.fields, found))
 
 
 # The answer

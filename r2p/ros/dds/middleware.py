@@ -19,7 +19,7 @@ from r2p.clock import real_clock, real_time
 from r2p.errors import ServiceError
 from r2p.ros.dds.cyclone import DdsEvents, Participant
 from r2p.ros.dds.graph import DdsEndpoint, DdsGraph, OwnNode, announce
-from r2p.ros.dds.names import DISCOVERY, dds_topic, user_data
+from r2p.ros.dds.names import DISCOVERY, dds_topic, ros_topic, user_data
 from r2p.ros.middleware import Middleware, MiddlewareUser, Qos, RosArrival, RosEndpoint, RosServer, RosService, RosType
 from r2p.ros.type_names import dds_type
 from r2p.runtime.backpressure import LINK_DOWN
@@ -359,12 +359,12 @@ class DdsMiddleware(Middleware):
         """Report that another endpoint of a topic has another type."""
         if peer.topic != topic:
             return
-        name = dds_type(own.name)
+        name, where = dds_type(own.name), ros_topic(topic)
         if peer.type != name:
-            text = f"{topic[2:]} has the type {own.name} here and {peer.type} elsewhere, so they are not connected: "
+            text = f"{where} has the type {own.name} here and {peer.type} elsewhere, so they are not connected: "
             self._user.notice(f"type {topic}", f"{text}--ros-type chooses another", trouble=True)
         elif peer.checksum and peer.checksum != own.checksum:
-            text = f"{topic[2:]}: another node has another definition of {own.name}, of another version of ROS, "
+            text = f"{where}: another node has another definition of {own.name}, of another version of ROS, "
             self._user.notice(f"type {topic}", f"{text}so values may be wrong: use the same", trouble=True)
 
     # Services

@@ -248,11 +248,6 @@ class Ros1Publication:
         for connection in list(self.connections):
             connection.close()
 
-    def abort(self) -> None:
-        """Close all connections at once."""
-        for connection in list(self.connections):
-            connection.abort()
-
     def _join(self, connection: SubscriberConnection) -> None:
         assert connection.transport is not None
         node, kind, qos = self.endpoint.node, self.endpoint.type, self.endpoint.qos

@@ -37,6 +37,9 @@ GID_BYTES = 16
 ATTACHMENT = struct.Struct("<qqB16s")
 """Sequence number, time in ns, GID_BYTES, and the gid."""
 
+ATTACHMENT_MAX = 512
+"""Bytes of an attachment; longer ones are not read."""
+
 _START = struct.Struct("<qqB")
 _TOKEN_MAX = 2048  # characters; names in ROS have at most 255
 _NODE_FIELDS, _ENDPOINT_FIELDS = 9, 13

@@ -19,6 +19,7 @@ from r2p.messages import SIZE_MAX
 from r2p.ros.middleware import Qos, RosServer, RosService
 from r2p.ros.ros2.graph import explain_mismatch
 from r2p.ros.ros2.keys import (
+    ATTACHMENT_MAX,
     GID_BYTES,
     EntityKind,
     data_key,
@@ -37,7 +38,6 @@ _REMEMBERED_MAX = 256  # requests of a service whose answers are kept for repeti
 _REPETITIONS_MAX = 16  # of a request that waits; of more, the oldest are dropped
 _REPLIES_MAX = 1024  # that wait for a caller which does not read; until then further requests are lost
 _KEPT_BYTES_MAX = 4096  # bytes of such an answer; a request with a longer one is served again
-_ATTACHMENT_MAX = 512  # bytes; longer ones are not read
 _ERROR_MAX = 4096  # bytes of an error's text
 _PAUSES = (0.1, 0.5, 2.0)  # seconds until a request is repeated that nothing answered, though there is a server
 _LONGEST_S = 86_400.0  # seconds that zenoh keeps a query without a time-out
@@ -135,7 +135,7 @@ class RmwServer:
         try:
             if payload is None or not 0 < len(payload) <= SIZE_MAX:
                 raise DecodeError("a request without a payload, or with one that is too long")
-            if header is None or len(header) > _ATTACHMENT_MAX:
+            if header is None or len(header) > ATTACHMENT_MAX:
                 raise DecodeError("a request needs an attachment: sequence number, time and gid")
             sequence, _, gid = decode_attachment(header.to_bytes())
         except DecodeError as error:
@@ -288,7 +288,7 @@ class RmwClient:
         if header is None:
             return True
         try:
-            number, _, gid = decode_attachment(header.to_bytes() if len(header) <= _ATTACHMENT_MAX else b"")
+            number, _, gid = decode_attachment(header.to_bytes() if len(header) <= ATTACHMENT_MAX else b"")
         except DecodeError:
             return False
         return number == sequence and gid == self._gid

@@ -19,6 +19,7 @@ from r2p.messages import SIZE_MAX
 from r2p.ros.middleware import Qos, RosArrival, RosEndpoint
 from r2p.ros.ros2.keys import (
     ATTACHMENT,
+    ATTACHMENT_MAX,
     GID_BYTES,
     EntityKind,
     RmwToken,
@@ -42,7 +43,6 @@ _CACHE_DEFAULT = 42  # messages that a transient local publisher keeps that keep
 _CACHE_MAX = 10_000
 _HEARTBEAT_S = 0.5  # seconds after which a subscriber of a transient local topic learns what it has missed
 _RING_MIN, _RING_MAX = 1024, 4096  # messages of one topic that wait in zenoh; of more, the oldest are lost
-_ATTACHMENT_MAX = 512  # bytes; longer ones are not read
 _BATCH = MESSAGES_PER_TURN // 2  # messages that are delivered at once: the link does not pause for them
 _unpack = ATTACHMENT.unpack
 _GAP_MAX = 1 << 24  # messages missed at once; more is a number that does not count
@@ -257,7 +257,7 @@ class RmwSubscription:
         header, payload = sample.attachment, sample.payload
         if not 0 < len(payload) <= SIZE_MAX:
             raise DecodeError("too long" if payload else "undecodable")
-        if header is None or len(header) > _ATTACHMENT_MAX:
+        if header is None or len(header) > ATTACHMENT_MAX:
             raise DecodeError("wrong attachment")
         data = header.to_bytes()
         try:  # that of rmw_zenoh without a call
