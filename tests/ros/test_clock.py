@@ -89,7 +89,7 @@ async def test_connections_have_real_time_and_what_they_deliver_has_not() -> Non
 
 
 def test_a_master_is_asked_while_the_simulator_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registration, "LOOK_S", 0.01)
+    monkeypatch.setattr(registration, "POLL_S", 0.01)
 
     async def main() -> None:
         asked, often = Counter[str](), asyncio.Event()

@@ -58,7 +58,7 @@ class Ros1Middleware(Middleware):
         """The slave URIs of each topic's publishers, by what the master has last reported to which node and topic."""
         self._servers: dict[tuple[str, str], Ros1Server] = {}
         self._callers = Ros1Callers(self._context)
-        self._probes = ServiceProbes(self._context, self._probe, lambda: self.session.look_soon())
+        self._probes = ServiceProbes(self._context, self._probe, lambda: self.session.poll_soon())
         self._closing: set[TcprosConnection] = set()
 
     @property

@@ -91,7 +91,7 @@ class ParameterMirror:
                 await self._wake.wait()
                 self._wake.clear()
                 try:
-                    await self._settle_all()
+                    await self._synchronise_all()
                 except Exception as error:  # noqa: BLE001 - counted and logged
                     self._link.stats.lost.internal_error(error)
         finally:
@@ -163,13 +163,13 @@ class ParameterMirror:
 
     # Making both the same
 
-    async def _settle_all(self) -> None:
+    async def _synchronise_all(self) -> None:
         while self._changed:
             key = next(iter(self._changed))
             del self._changed[key]
             try:
                 if (each := self._mirrored.get(key)) is not None:
-                    await self._settle(each)
+                    await self._synchronise(each)
             except MasterError as error:
                 self._notice(key, f"the ROS master refuses the parameter {key}: {error}")
             except _MASTER_ERRORS:  # the session says what is wrong, and what is set when it is back
@@ -177,7 +177,7 @@ class ParameterMirror:
                 self._client.close()
                 await asyncio.sleep(_RETRY_S)
 
-    async def _settle(self, each: _Mirrored) -> None:
+    async def _synchronise(self, each: _Mirrored) -> None:
         if each.is_new:
             each.is_new = False
             await self._give(each)

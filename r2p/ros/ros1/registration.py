@@ -21,8 +21,8 @@ from r2p.ros.ros1.xmlrpc import XmlRpcClient, XmlRpcError, XmlRpcServer, split_u
 from r2p.ros.ros1.xmlrpc_codec import Value
 from r2p.units import SECOND
 
-LOOK_S: Final = 1.0
-"""Seconds between two looks at what is registered."""
+POLL_S: Final = 1.0
+"""Seconds between two polls of what is registered."""
 
 RETRY_S: Final = 0.25
 """Seconds between two attempts to reach a master."""
@@ -30,7 +30,7 @@ RETRY_S: Final = 0.25
 PUBLISHERS_MAX: Final = 1000
 """Publishers of a topic that are connected to; further ones are counted."""
 
-_SOON_S: Final = 0.05  # seconds from a hint of the master that something has changed to the next look
+_SOON_S: Final = 0.05  # seconds from a hint of the master that something has changed to the next poll
 _CLOSE_S: Final = 2.0  # seconds for a master to take what is unregistered at the end
 _ASK_S: Final = 1.0  # seconds for another node to say who it is
 
@@ -88,7 +88,7 @@ class MasterSession:
         self._graph: RosGraph | None = None
         self._trouble = ""
         self._outages = 0
-        self._look_at = 0.0
+        self._poll_at = 0.0
         self._changed = asyncio.Event()
         self._updated: set[tuple[str, str]] = set()
         """Subscriptions whose publishers the master has reported since they were registered."""
@@ -206,7 +206,7 @@ class MasterSession:
                     raise Broken(self._broken)
                 try:
                     await self._step()
-                    pause = max(0.0, self._look_at - _now())
+                    pause = max(0.0, self._poll_at - _now())
                 except (MasterError, *_GONE) as error:
                     self._note_gone(error)
                     pause = RETRY_S
@@ -218,14 +218,14 @@ class MasterSession:
 
     async def _step(self) -> None:
         self._changed.clear()
-        looks = _now() >= self._look_at
-        if looks:
+        polls = _now() >= self._poll_at
+        if polls:
             await self._check_master()
         await self._synchronise()
         self._note_up()
-        if looks:
-            await self._look()
-            self._look_at = _now() + LOOK_S
+        if polls:
+            await self._poll()
+            self._poll_at = _now() + POLL_S
 
     async def _check_master(self) -> None:
         """Find out whether this is the master that was registered with, and the host by which it is reached."""
@@ -312,7 +312,7 @@ class MasterSession:
 
     # What the master knows
 
-    async def _look(self) -> None:
+    async def _poll(self) -> None:
         before = frozenset(self._nodes)  # one may end meanwhile, and is still in the answer
         state = await self.master.get_system_state(self._name())
         types = await self.master.get_topic_types(self._name())
@@ -353,7 +353,7 @@ class MasterSession:
     def publishers_updated(self, node: str, topic: str, publishers: list[str]) -> None:
         """Note all publishers of a topic."""
         self._updated.add((node, topic))
-        self.look_soon()
+        self.poll_soon()
         own = {self.slave_uri(each) for each in self._nodes}
         if node in self._nodes and topic in self._nodes[node].subscriptions:
             others = [uri for uri in dict.fromkeys(publishers) if uri not in own]
@@ -423,7 +423,7 @@ class MasterSession:
     def _note_gone(self, error: Exception) -> None:
         """Say once that there is no master, or none any more: then connections go on, so the link stays up."""
         self.client.close()
-        self._look_at = 0.0
+        self._poll_at = 0.0
         reason = _reason(self.address.master, error)
         if self._user is None or reason == self._trouble:
             return
@@ -470,9 +470,9 @@ class MasterSession:
     def _touch(self) -> None:
         self._changed.set()
 
-    def look_soon(self) -> None:
-        """Look at what is registered in a moment: something has changed."""
-        self._look_at = min(self._look_at, _now() + _SOON_S)
+    def poll_soon(self) -> None:
+        """Poll what is registered in a moment: something has changed."""
+        self._poll_at = min(self._poll_at, _now() + _SOON_S)
         self._touch()
 
 

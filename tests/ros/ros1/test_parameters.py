@@ -39,7 +39,7 @@ class Mode(enum.Enum):
 def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("MODULES_PERIOD_S", "_OWN_PERIOD_S", "_REMOTE_PERIOD_S"):
         monkeypatch.setattr(exposed_parameters, name, 0.05)
-    monkeypatch.setattr(registration, "LOOK_S", 0.1)
+    monkeypatch.setattr(registration, "POLL_S", 0.1)
 
 
 @pytest.fixture

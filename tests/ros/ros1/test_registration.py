@@ -36,7 +36,7 @@ STRING = "std_msgs/String"
 
 @pytest.fixture(autouse=True)
 def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registration, "LOOK_S", 0.1)
+    monkeypatch.setattr(registration, "POLL_S", 0.1)
 
 
 @pytest.fixture
