@@ -152,9 +152,13 @@ class NetworkView:
             raise Error(f"{module} is firmware: {firmware}")
         if view.kind == "ROS":
             raise Error(f"{module} is a ROS node, which knows nothing of r2p's modules: use the commands of ROS")
-        if view.link and (view.wire or 0) < WIRE_MIN:
-            known = f"has wire version {view.wire}" if view.wire else "does not say which version of r2p it has"
-            raise Error(f"{module} {known}, {what} need {WIRE_MIN}: update r2p there")
+        if view.link and view.wire is None:
+            raise Error(
+                f"{module} is a ROS node behind a gateway, or its r2p is too old for {what}: use the commands of ROS, "
+                "or update r2p there"
+            )
+        if view.link and view.wire is not None and view.wire < WIRE_MIN:
+            raise Error(f"{module} has wire version {view.wire}, {what} need {WIRE_MIN}: update r2p there")
         services = self._opened().own_services
         call = services.change if operation.changes else services.fetch
         try:

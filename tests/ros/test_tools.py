@@ -9,6 +9,8 @@ from r2p.msg import Float32, String
 from r2p.ros.topics import ros_class
 from r2p.testing.network import node_in
 from r2p.tools.config import Settings
+from r2p.tools.param import targets
+from r2p.tools.session import Session
 from r2p.tools.types import Types
 from tests.ros.fake import FakeRosNetwork
 
@@ -59,3 +61,18 @@ async def test_a_topic_has_the_type_that_ros_nodes_call_it_by(version: int) -> N
     assert view.fingerprint == r2p.layout(Float32).fingerprint
     assert (view.ros_type, shown["type"]) == ("std_msgs/Float32", "std_msgs/Float32")
     assert later is None
+
+
+@both
+@pytest.mark.virtual_time
+async def test_ros_nodes_are_not_asked_for_parameters_of_r2p(version: int) -> None:
+    network = FakeRosNetwork(version)
+    talker = network.node("/talker")
+    talker.advertise("/chatter", String)
+    settings = Settings(via=[f"ros{version}:"])
+    async with r2p.Module("_tool", via=network.transport(), observer=True) as module:
+        session = Session(module, settings)
+        with pytest.raises(r2p.Error, match=f"only ROS nodes on ros{version}:: talker; .* rosparam and ros2 param"):
+            await targets.find(session, None)
+        with pytest.raises(r2p.Error, match="talker is a ROS node, which knows nothing of r2p's modules"):
+            await targets.find(session, "talker")

@@ -68,7 +68,14 @@ async def find_modules(session: Session, target: str | None, wait: float | None 
         )
     if not names and target is not None and "/" in target:
         raise TimedOut(unknown_module(session, target.partition("/")[0]))
-    return names or sorted(name for name, view in known.items() if view.instance is not None)
+    others = {name: view for name, view in known.items() if view.instance is not None}
+    ours = sorted(name for name, view in others.items() if not _is_ros(view))
+    if others and not ours and not names:
+        raise r2p.Error(
+            f"there are only ROS nodes on {session.network_name}: {', '.join(sorted(others))}; their parameters are "
+            "those of rosparam and ros2 param"
+        )
+    return names or ours
 
 
 def meant(infos: Infos, target: str) -> Infos:
@@ -144,6 +151,11 @@ async def _ask(session: Session, modules: list[str]) -> Infos:
 def _known(session: Session) -> dict[str, r2p.ModuleView]:
     """Return the modules on the network by name, without tools."""
     return {view.name: view for view in session.module.network.modules() if view.link and view.state != "observer"}
+
+
+def _is_ros(view: r2p.ModuleView) -> bool:
+    """Return whether this is a ROS node; those behind a gateway look like modules without a wire version."""
+    return view.kind == "ROS" or view.wire is None
 
 
 def _prefix(session: Session, target: str | None) -> list[str]:
