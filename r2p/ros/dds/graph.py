@@ -16,6 +16,12 @@ from r2p.ros.cdr import cdr
 from r2p.ros.dds.names import join_node, ros_topic, ros_type, split_node
 from r2p.ros.middleware import Qos, RosGraph, RosPeerEndpoint
 
+MESSAGE_MAX = 1 << 20
+"""Bytes of the message with the nodes of a participant: a thousand nodes with all their endpoints have half of that."""
+
+ENTRIES_MAX = 131_072
+"""Nodes and endpoints that all participants may announce together."""
+
 _NAMES_MAX = 256  # bytes of a name, as in ROS's definition of these messages
 
 
@@ -82,6 +88,7 @@ class DdsGraph:
         self.writers: dict[bytes, DdsEndpoint] = {}
         self.readers: dict[bytes, DdsEndpoint] = {}
         self._nodes: dict[bytes, dict[str, frozenset[bytes]]] = {}
+        self._entries = 0  # in `_nodes`
         self._owners: dict[bytes, str] = {}
         self._by_handle: dict[int, DdsEndpoint] = {}
 
@@ -101,26 +108,44 @@ class DdsGraph:
 
     def remove_participant(self, gid: bytes) -> None:
         """Forget the nodes of a participant that is gone; DDS reports the end of its endpoints itself."""
-        for gids in self._nodes.pop(gid, {}).values():
+        nodes = self._nodes.pop(gid, {})
+        self._entries -= _entries(nodes)
+        for gids in nodes.values():
             for each in gids:
                 self._owners.pop(each, None)
 
     def announced(self, data: bytes) -> bool:
-        """Note the nodes of a participant, from its message; return whether that could be read."""
+        """Note the nodes of a participant, from its message; return whether that could be read, and had room."""
         try:
-            info = _CODEC.decode(data)
+            info = _CODEC.decode(data) if len(data) <= MESSAGE_MAX else None
         except DecodeError:
+            info = None
+        if info is None:
             return False
         self.remove_participant(info.gid.data)
-        if len(self._nodes) < TABLE_MAX:
-            nodes = self._nodes[info.gid.data] = {
-                join_node(node.node_namespace, node.node_name): frozenset(
-                    gid.data for gid in (*node.reader_gid_seq, *node.writer_gid_seq)
-                )
-                for node in info.node_entities_info_seq
-            }
-            self._owners |= {gid: name for name, gids in nodes.items() for gid in gids}
+        nodes = {
+            join_node(node.node_namespace, node.node_name): frozenset(
+                gid.data for gid in (*node.reader_gid_seq, *node.writer_gid_seq)
+            )
+            for node in info.node_entities_info_seq
+        }
+        if not self._has_room(nodes):
+            self._forget_made_up()
+            if not self._has_room(nodes):
+                return False
+        self._nodes[info.gid.data] = nodes
+        self._entries += _entries(nodes)
+        self._owners |= {gid: name for name, gids in nodes.items() for gid in gids}
         return True
+
+    def _has_room(self, nodes: Mapping[str, frozenset[bytes]]) -> bool:
+        return len(self._nodes) < TABLE_MAX and self._entries + _entries(nodes) <= ENTRIES_MAX
+
+    def _forget_made_up(self) -> None:
+        """Forget participants without any endpoint: messages may name some that have never been there."""
+        real = {each.participant for table in (self.writers, self.readers) for each in table.values()}
+        for gid in self._nodes.keys() - real:
+            self.remove_participant(gid)
 
     def writer_of(self, handle: int) -> tuple[str, bytes]:
         """Return the node and the GUID of the writer of a sample, empty where it is not known."""
@@ -143,3 +168,8 @@ class DdsGraph:
             for each in endpoints
             if (topic := ros_topic(each.topic))
         )
+
+
+def _entries(nodes: Mapping[str, frozenset[bytes]]) -> int:
+    """Return the number of nodes and endpoints."""
+    return len(nodes) + sum(map(len, nodes.values()))

@@ -1,5 +1,7 @@
 """Names in DDS, and the graph that follows from what DDS and other participants report."""
 
+import msgspec
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -69,7 +71,25 @@ def test_bytes_from_the_network_never_raise(data: bytes) -> None:
 def test_what_others_announce_is_bounded() -> None:
     graph = DdsGraph()
     for number in range(TABLE_MAX + 5):
-        graph.add(endpoint(number.to_bytes(16, "big"), "rt/scan", number), writes=True)
-        graph.announced(announce(number.to_bytes(16, "big"), {f"/n{number}": OwnNode()}))
+        gid = number.to_bytes(16, "big")
+        graph.add(msgspec.structs.replace(endpoint(gid, "rt/scan", number), participant=gid), writes=True)
+        graph.announced(announce(gid, {f"/n{number}": OwnNode()}))
     found = graph.ros_graph()
     assert (len(found.publishers), len(found.nodes)) == (TABLE_MAX, TABLE_MAX)
+
+
+def test_participants_that_are_made_up_take_no_room_for_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anyone may send the message of any participant; real ones have endpoints."""
+    monkeypatch.setattr("r2p.ros.dds.graph.ENTRIES_MAX", 20)
+    graph = DdsGraph()
+    graph.add(endpoint(SCAN, "rt/scan", 7), writes=True)
+    for number in range(100):
+        made_up = OwnNode(writers=[bytes([number, each]) + bytes(14) for each in range(3)])
+        assert graph.announced(announce(bytes([number]) * 16, {f"/n{number}": made_up}))
+        assert (len(graph._nodes) <= 5, len(graph._owners) <= 15) == (True, True)
+    assert graph.announced(announce(PEER, {"/lidar": OwnNode(writers=[SCAN])}))
+    large = announce(b"l" * 16, {f"/{number}": OwnNode() for number in range(19)})
+    assert not graph.announced(large)
+    assert not graph.announced(large + bytes(1 << 20))
+    assert graph.ros_graph().nodes == {"/lidar"}
+    assert graph.announced(announce(PEER, {f"/{number}": OwnNode() for number in range(20)}))
