@@ -345,12 +345,25 @@ class RosLink(BufferedLink, MiddlewareUser):
 
     def receive_other(self, arrival: Any) -> None:
         if arrival.topic != _GATEWAYS_KEY:
-            super().receive_other(arrival)
+            if not (isinstance(arrival, RosArrival) and self._deliver_unannounced(arrival)):
+                super().receive_other(arrival)
             return
         data = self._gateways.decode(arrival.data)
         if (instance := sender_of(data)) is not None:
             self._apply(self._ros.set_instance(self._clock.monotonic(), arrival.node, instance))
         self.manage(data, arrival.node)
+
+    def _deliver_unannounced(self, arrival: RosArrival) -> bool:
+        """Deliver a message that came before the graph has shown its publisher; return whether it is subscribed."""
+        name = self._by_ros_name.get(arrival.topic.decode(errors="replace"), "")
+        topic = self._space.topics.get(name)
+        if topic is None or not topic.wanted or name not in self._subscribed:
+            return False
+        self.stats.received += 1
+        sample = self.sample(name, arrival)
+        for sink in topic.deliver(sample) or ():
+            sink.force(sample)
+        return True
 
     def _is_taken(self, name: str, instance: int) -> bool:
         """Return whether another module has this name on another link."""

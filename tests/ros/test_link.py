@@ -13,7 +13,8 @@ from r2p.messages import Timestamp
 from r2p.msg import IMU, Header, Log, String, Velocity3
 from r2p.names import TOPIC, module_path, node_name, topic_name
 from r2p.ros.graph_names import GraphNames
-from r2p.ros.middleware import Qos, RosType
+from r2p.ros.link import RosLink
+from r2p.ros.middleware import Qos, RosArrival, RosType
 from r2p.ros.options import QosChange, RosOptions, namespace, qos_change
 from r2p.ros.topics import ros_class
 from r2p.ros.transport import ros_transport
@@ -95,6 +96,20 @@ async def test_messages_of_this_module_do_not_come_back(version: int) -> None:
         await publisher.publish(Speed(1.0))
         await asyncio.sleep(0.1)
         assert len(subscriber.queue) == 1
+
+
+@pytest.mark.virtual_time
+async def test_a_message_may_come_before_its_publisher_is_seen() -> None:
+    """Messages and the graph travel apart from each other; what nobody here subscribes to is counted as ever."""
+    network = FakeRosNetwork(1)
+    async with r2p.Module("PC1", via=network.transport()) as module, node_in(module) as node:
+        subscriber = node.subscribe("goal", Speed)
+        await asyncio.sleep(0.1)
+        link = module.links[0]
+        assert isinstance(link, RosLink)
+        link.received([RosArrival(name, Speed(2.0).encode()) for name in (b"/goal", b"/other", b"/\xff")])
+        assert await subscriber.fetch() == Speed(2.0)
+        assert link.losses == {"not subscribed": 2}
 
 
 @both
