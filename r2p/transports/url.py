@@ -28,7 +28,7 @@ BUILT_IN = {
     "tcp": "r2p.transports.tcp:TcpTransport",
     "tcp-listen": "r2p.transports.tcp:TcpListenTransport",
     "serial": "r2p.transports.serial:SerialTransport",
-    "ros1": "r2p.ros.ros1:from_url",
+    "ros1": "r2p.ros.ros1.transport:from_url",
     "rtcan": "r2p.transports.rtcan.transport:from_url",
     "sim": "r2p.sim.transport:from_url",
     "zenoh": "r2p.transports.zenoh:from_url",

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from r2p.errors import InvalidName, TransportError
 from r2p.ros.graph_names import GraphNames
 from r2p.ros.options import RosOptions
-from r2p.ros.ros1 import from_url
 from r2p.ros.ros1.environment import RosAddress, find_address, reachable_host, uri_of
 from r2p.ros.ros1.names import arguments, is_name, join, namespace_of, resolve
+from r2p.ros.ros1.transport import from_url
 from r2p.transports.url import parse
 
 

@@ -11,8 +11,9 @@ import pytest
 
 import r2p
 from r2p.ros import exposed_parameters
-from r2p.ros.ros1 import from_url, registration
+from r2p.ros.ros1 import registration
 from r2p.ros.ros1.master import MasterClient, MasterError
+from r2p.ros.ros1.transport import from_url
 from r2p.ros.ros1.xmlrpc import XmlRpcClient
 from r2p.testing.network import Network, node_in
 from r2p.transports.url import parse
