@@ -43,7 +43,7 @@ from r2p.ros.qos import publisher_qos, subscriber_qos
 from r2p.ros.registrations import TYPE_UNKNOWN, NotOnRos, Registrations
 from r2p.ros.services import RosServices, ServiceArrival
 from r2p.ros.topic_classes import TopicClasses
-from r2p.ros.topics import RosTopic, TopicTypes, is_own
+from r2p.ros.topics import RosTopic, TopicTypes, is_of_action, is_own
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.buffered_link import BufferedLink
@@ -172,6 +172,8 @@ class RosLink(BufferedLink, MiddlewareUser):
         asked = lookup(self.options.types, topic) or lookup(self.options.ros_types, topic)
         if is_own(topic) and not asked:
             return None, ""
+        if self.middleware.version == 1 and is_of_action(topic):
+            return None, ""  # reported once for the action, with its service
         if name is None:
             return None, "ROS has no such names: parts begin with a letter, and all have at most 240 characters"
         peers = self._ros.peers_of(topic)

@@ -22,7 +22,7 @@ from r2p.messages import Layout, Message, layout
 from r2p.names import SERVICE_SUFFIXES
 from r2p.protocols.discovery.events import Event, TopicType
 from r2p.ros import std_srvs
-from r2p.ros.action_types import CancelGoal
+from r2p.ros.action_types import SEND_GOAL, CancelGoal
 from r2p.ros.discovery import RosDiscovery
 from r2p.ros.graph_names import GraphNames
 from r2p.ros.middleware import (
@@ -40,6 +40,7 @@ from r2p.ros.options import RosOptions, lookup
 from r2p.ros.registrations import CALLS, SERVES, TYPE_UNKNOWN, NotOnRos, Registrations, RosClient
 from r2p.ros.service_calls import UNKNOWN_LIFETIME, CarriedService, RosCalls, RosRequests
 from r2p.ros.service_types import RosServiceCodec, ServiceShape, service_codec, service_shape, service_type
+from r2p.ros.topics import is_of_action
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.services.definition import Definition, define
 from r2p.services.server import server_of
@@ -228,9 +229,13 @@ class RosServices:
 
     def _codec(self, name: str) -> RosServiceCodec | None:
         """Return how a service travels; None without its types, or if ROS can't have them: then why is reported."""
+        version = self._link.middleware.version
+        if version == 1 and is_of_action(name):
+            self.not_on_ros.note(name, "actions are those of ROS 2, ROS 1 has none" if name.endswith(SEND_GOAL) else "")
+            return None
         try:
             layouts = self._layouts(name)
-            codec = None if layouts is None else _codec_of(*layouts, self._link.middleware.version)
+            codec = None if layouts is None else _codec_of(*layouts, version)
             reason = TYPE_UNKNOWN if layouts is None else ""
         except MessageError as error:
             codec, reason = None, str(error)

@@ -53,6 +53,11 @@ def is_own(topic: str) -> bool:
     return topic in _OWN or topic.startswith(LOADER_PREFIX)
 
 
+def is_of_action(name: str) -> bool:
+    """Return whether a topic or a service is a part of an action, which ROS 1 has none of."""
+    return "/_action/" in name
+
+
 @functools.lru_cache(maxsize=1024)
 def ros_type(cls: type[Message], version: int) -> RosType:
     """Return the type of a class in ROS 1 or 2. Raises MessageError if ROS can't have it."""

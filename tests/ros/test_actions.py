@@ -309,3 +309,17 @@ def test_mistakes() -> None:
                 await client.send(Count.Goal())
 
     asyncio.run(main())
+
+
+@pytest.mark.virtual_time
+async def test_an_action_is_not_on_ros_1(caplog: pytest.LogCaptureFixture) -> None:
+    """ROS 1 has no such types: its master would refuse some of the topics, and clients would find a part of them."""
+    caplog.set_level("INFO")
+    network = FakeRosNetwork(1)
+    async with r2p.Module("BOT", via=network.transport()) as module, node_in(module, name="counter") as node:
+        ActionServer(node, "count", Count, count)
+        await asyncio.sleep(5)
+        graph = network.graph(network.node("/other"))
+    assert {each.topic for each in graph.publishers | graph.subscribers if "action" in each.topic} == set()
+    assert graph.servers == frozenset()
+    assert caplog.text.count("actions are those of ROS 2, ROS 1 has none") == 1
