@@ -22,6 +22,7 @@ from r2p.ros.middleware import RosPeerEndpoint
 from r2p.ros.topics import TopicTypes, ros_class, ros_type
 from r2p.transports.link import Hub
 
+_PEERS_MAX = 64  # publishers and subscribers of one topic whose types are looked at: a flood has one for each
 _TRIES = 12
 
 _DEFINITIONS_MAX = 32 << 20  # characters of definitions that are kept; those of all types of a robot are a million
@@ -84,7 +85,7 @@ class TopicClasses:
 
     def of_peers(self, topic: str, peers: Sequence[RosPeerEndpoint]) -> type[Message] | None:
         """Return the class of the type that ROS nodes have for a topic, the first of several; None if it is unknown."""
-        for peer in peers:
+        for peer in peers[:_PEERS_MAX]:
             found = self._of_peer(topic, peer) if peer.type else None
             if found is not None:
                 self._remember(topic, found)

@@ -101,3 +101,13 @@ async def test_definitions_have_a_limit_in_all(monkeypatch: pytest.MonkeyPatch) 
     classes.add_definition("my_msgs/Long", "", "float32 speed" + " " * (1 << 20))
     assert ("my_msgs/Long", "") not in classes._definitions
     classes.close()
+
+
+@pytest.mark.virtual_time
+async def test_a_flood_of_types_of_one_topic_is_not_looked_at_one_by_one() -> None:
+    asked = Asked([], {})
+    peers = [RosPeerEndpoint(f"/{number}", "/x", f"my_msgs/T{number}", "RIHS01_00") for number in range(20_000)]
+    assert asked.classes.find("x", (NOTHING, NOTHING), peers) is None
+    await asyncio.sleep(1)
+    assert asked.nodes == [f"/{number}" for number in range(64)]
+    asked.classes.close()
