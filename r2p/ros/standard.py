@@ -85,7 +85,12 @@ def header(ns: int, frame: str) -> Header:
 
 
 def quaternion(cls: Any, roll: float, pitch: float, yaw: float) -> Any:
-    """Return the rotation about the fixed axes x, y, z in this order, as a geometry_msgs/Quaternion."""
+    """Return the rotation about the fixed axes x, y, z in this order, as a geometry_msgs/Quaternion.
+
+    Raises MessageError for an infinite angle; NaN makes a quaternion of NaN.
+    """
+    if math.isinf(roll) or math.isinf(pitch) or math.isinf(yaw):
+        raise MessageError(f"{roll}, {pitch}, {yaw}: an infinite angle is not a rotation")
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)

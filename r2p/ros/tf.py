@@ -77,8 +77,9 @@ async def _publish_poses(node: Node, type: type[r2p.msg.Odometry] | type[r2p.msg
         pose = sample.message.pose
         try:
             stamp = Timestamp.from_ns(stamps.find(sample))
-        except MessageError:  # of a module whose clock is beyond 2106
+            rotation = quaternion(Quaternion, 0.0, 0.0, pose.w)
+        except MessageError:  # of a module whose clock is beyond 2106, or with an infinite angle
             continue
         header = r2p.msg.Header(stamp=stamp, frame_id=frame.value)
-        place = Transform(Vector3(pose.x, pose.y), quaternion(Quaternion, 0.0, 0.0, pose.w))
+        place = Transform(Vector3(pose.x, pose.y), rotation)
         await transforms.publish(TFMessage((TransformStamped(header, child.value, place),)))

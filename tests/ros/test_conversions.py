@@ -288,6 +288,17 @@ def test_any_numbers_are_converted_or_refused(cls: Any, version: int, data: byte
         found.from_ros(message).encode()
 
 
+@pytest.mark.parametrize("cls", [msg.IMU, msg.Odometry, Pose3])
+@pytest.mark.parametrize("angle", [math.inf, -math.inf, math.nan])
+def test_angles_that_are_not_numbers_do_not_raise_in_the_link(cls: Any, angle: float) -> None:
+    """A sensor may say anything: an infinite angle has no quaternion, and is counted as not convertible."""
+    found = pair(cls, 2)
+    pose = Pose3(1.0, 2.0, angle)
+    message = {Pose3: pose, msg.Odometry: msg.Odometry(pose, Velocity3())}.get(cls, msg.IMU(yaw=angle))
+    with contextlib.nullcontext() if math.isnan(angle) else pytest.raises(r2p.MessageError, match="infinite angle"):
+        found.to_ros(message, 1, Source())
+
+
 @given(st.sampled_from([1, 2]), st.text(max_size=40), st.text(max_size=200), st.integers(0, 100))
 def test_any_log_record_of_ros_is_one_of_r2p(version: int, name: str, text: str, level: int) -> None:
     found = pair(Log, version)
