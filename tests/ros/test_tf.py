@@ -30,6 +30,7 @@ async def test_the_pose_of_a_robot_is_a_transform(version: int) -> None:
         odometry = robot.advertise("odometry", Odometry)
         await odometry.wait_subscriber()
         stamp = robot.now()
+        await odometry.publish(Odometry(Pose3(w=float("inf"))))  # is left out
         await odometry.publish(Odometry(Pose3(1.0, 2.0, 3.14159265)))
         await asyncio.sleep(0.1)
     ((transform,),) = [each.transforms for each in transforms]
