@@ -1,5 +1,6 @@
 """Each message that a real ROS program has serialised has the same bytes here, and means the same."""
 
+import ast
 from typing import Any
 
 import pytest
@@ -86,6 +87,21 @@ def test_odd_bytes_of_ros1(case: Case) -> None:
         assert case.get("reencoded") != case["bytes"]
     else:
         assert found.encode().hex() in (case["bytes"], case.get("reencoded"))
+
+
+@pytest.mark.parametrize("case", recorded(1)["encode_edge"], ids=lambda case: f"{case['type']}-{case['note']}")
+def test_odd_values_of_ros1(case: Case) -> None:
+    """What genpy refuses r2p refuses, with an error that names the field; so are a number for a bool and a duration for
+    a time, which genpy packs.
+    """
+    (name, text), *_ = case["fields"].items()
+    value = r2p.Duration(1, 2) if text.startswith("genpy.Duration") else ast.literal_eval(text)
+    made = class_of(1, case["type"])(**{name: value})
+    if case["note"] in ("int 1 for bool", "duration for time") or "error" in case:
+        with pytest.raises(r2p.MessageError, match=rf"\w+\.{name} \("):
+            made.encode()
+    else:
+        assert made.encode().hex() == case["bytes"]
 
 
 def test_a_message_begins_with_its_header() -> None:
