@@ -36,8 +36,8 @@ from r2p.protocols.discovery.events import TopicType
 from r2p.runtime.queues import WakeScheduler
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.transports.announcement import Announcement
-from r2p.transports.link import GatewayHooks, Link
+from r2p.transports.announcement import Announcement, GatewayHooks
+from r2p.transports.link import Link
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 _FORWARDS = (PortState.ALONE, PortState.FORWARDING)

@@ -38,7 +38,7 @@ class CallRelay:
         self._instances.pop(link, None)
 
     def is_read_only(self, link: Link) -> bool:
-        """Return whether nothing may go onto a link, so that nothing may be changed from there either."""
+        """Return whether a link is read-only: it carries no messages out, and no changes in."""
         return self._policy.is_read_only(link.name)
 
     def passes_on(self, link: Link, call: OwnCall) -> bool:

@@ -232,7 +232,7 @@ class DirectoryRelay:
             self._repeat_slice(port, link, link.to_repeat, now)
 
     def _put_off(self, port: BridgePort, now: int) -> None:
-        """Look again soon, as nothing can be announced there now."""
+        """Look again soon, because that link can't announce now."""
         link = self._link(port)
         if link.repeat_at is not None or link.asked:
             link.repeat_at = max(link.repeat_at or 0, now + _APART)

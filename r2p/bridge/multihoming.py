@@ -15,8 +15,8 @@ from r2p.protocols.bridge.link_selection import LinkSelection
 from r2p.protocols.discovery.events import TopicType
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.transports.announcement import NOTHING, Announcement
-from r2p.transports.link import GatewayHooks, Link
+from r2p.transports.announcement import NOTHING, Announcement, GatewayHooks
+from r2p.transports.link import Link
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 _TYPES = {ManagementType.ALIVE, ManagementType.HELLO, *management.GATEWAY_TYPES}
@@ -99,7 +99,7 @@ class MultihomedModule:
         return is_for_us
 
     def _select(self, now: int, number: int, message: management.Management, data: bytes) -> bool:
-        """Enter what a message shows about the links; return False for nothing."""
+        """Enter what a message shows about the links; return False for a message about something else."""
         match message:
             case management.Bridge():
                 self.selection.receive_bridge(now, number, message)
@@ -172,7 +172,7 @@ class MultihomedModule:
         return max(((info.size, info.varies) for info in infos if info is not None), default=(0, False))
 
     def _drop_filter(self, topic: Topic) -> Callable[[str], bool]:
-        """Return a function that says whether messages from a link, by name, are dropped, as it is no longer used.
+        """Return a predicate for names of links: True if messages from that link are dropped.
 
         It is asked before each message while gateways consent to the use of several links for a while only: a module
         that was stopped must not go on with them.

@@ -107,7 +107,7 @@ def _ask(message: Loader, kind: type[T], patience: float = 0.0, repeats: int = 0
 
 
 def go_idle() -> Procedure[None]:
-    """End whatever the loader is in the middle of. An unfinished load leaves nothing but used RAM."""
+    """Abort the loader's current procedure. An unfinished load only leaves RAM in use."""
     yield from _begin(BeginLoader(), Ack)
     yield LoaderStep(BeginLoader())  # refused, as a session is open: that ends it
 

@@ -78,7 +78,7 @@ class ClientGoal(Generic[G, R, F]):
 
     @property
     def has_ended(self) -> bool:
-        """Return whether the goal has ended, or nothing more will be known of it."""
+        """Return whether the goal has ended, or its outcome will stay unknown."""
         return self._ended.done()
 
     async def __aiter__(self) -> AsyncIterator[F]:
@@ -111,7 +111,7 @@ class ClientGoal(Generic[G, R, F]):
         return result
 
     async def cancel(self, timeout: float = 1.0) -> bool:
-        """Ask the server to cancel the goal; return whether it does so. `wait` then says how the goal has ended.
+        """Ask the server to cancel the goal; return whether it accepts. `wait` then returns how the goal has ended.
 
         Raises what calls raise: TimeoutError without an answer, NoServer, ServiceError.
         """
@@ -144,7 +144,7 @@ class ClientGoal(Generic[G, R, F]):
             self._ended.set_result((state, result))
 
     def fail(self, error: Error) -> None:
-        """Enter the reason why nothing more will be known of the goal."""
+        """Enter the reason why the outcome of the goal will stay unknown."""
         if not self._ended.done():
             self._ended.set_exception(error)
             self._ended.exception()  # it need not be waited for
@@ -262,7 +262,7 @@ class ActionClient(HandlerOwner, Generic[G, R, F]):
         return []  # until the node is closed, its clean-up may cancel goals, and wait for their end
 
     def close(self) -> None:
-        """End the client. Those who wait for goals get Closed; the goals go on: cancel them first, or let them be."""
+        """End the client. Waiting calls raise Closed. The goals themselves go on: cancel them first to end them."""
         if self._closed:
             return
         self._closed = True
@@ -276,7 +276,7 @@ class ActionClient(HandlerOwner, Generic[G, R, F]):
         self._node.forget(self)
 
     async def cancel_quietly(self, goal_id: bytes) -> None:
-        """Cancel a goal that nothing waits for any more; without an answer it is left to itself."""
+        """Cancel a goal without a waiting caller, once; a failure is only logged."""
         try:
             await self.cancel_goals(GoalInfo(UUID(goal_id)), _CANCEL_TIMEOUT)
         except (TimeoutError, Error) as error:

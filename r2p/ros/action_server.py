@@ -174,7 +174,7 @@ class ActionServer(HandlerOwner, Generic[G, R, F]):
         return [goal.task for goal in running if goal.task is not None]
 
     def close(self) -> None:
-        """End the action: goals that run are aborted, and nothing of it is answered any more."""
+        """End the action: abort running goals, and stop answering requests."""
         if self._closed:
             return
         self.stop("its server was closed")
@@ -345,7 +345,7 @@ class ActionServer(HandlerOwner, Generic[G, R, F]):
         return CancelCode.TERMINATED if goal_id in self.goals else CancelCode.UNKNOWN_GOAL, chosen
 
     async def _get_result(self, request: Any) -> Any:
-        """Wait for the end of a goal; of an unknown one, say so."""
+        """Wait for the end of a goal; return state UNKNOWN for an unknown one."""
         goal, response = self.goals.get(request.goal_id.uuid), self.types.get_result.Response
         if goal is None:
             return response(status=GoalState.UNKNOWN, result=layout(self.types.result).zero)

@@ -119,7 +119,7 @@ class CancelCode(enum.IntEnum):
 
 
 class GoalRejected(Error):
-    """A goal that the server did not accept; its log says why."""
+    """A goal that the server rejected; the reason is in the server's log."""
 
 
 class GoalAborted(Error):

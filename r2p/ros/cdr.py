@@ -98,9 +98,7 @@ def cdr(cls: type[Message]) -> CdrCodec:
 
 
 def packed_size(cls: type[Message]) -> int:
-    """Return the size of messages whose CDR is their packing behind HEADER, as nothing has to be aligned; 0 for a class
-    with others.
-    """
+    """Return the size of messages whose CDR is HEADER and their packing, without padding; 0 for other classes."""
     shape = layout(cls)
     return shape.size if shape.exact_size and _end_if_aligned(Nested(shape), 0) == shape.size else 0
 

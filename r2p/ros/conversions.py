@@ -62,7 +62,7 @@ class TypePair(msgspec.Struct, frozen=True):
 
 
 def conversion(ours: type[Message], theirs: str, version: int, names: RosNames = NO_NAMES) -> Conversion | None:
-    """Return the conversion between a message class and a type of ROS 1 or 2, by its name; None if there is none.
+    """Return the conversion between a message class and a type of ROS 1 or 2, by its name, or None.
 
     Raises MessageError, which says what to install, if rosbags is missing, which has the definitions of ROS.
     """

@@ -72,7 +72,7 @@ class Registrations:
         self._add_nodes()
 
     def close(self) -> None:
-        """Show no node any more."""
+        """Remove all nodes from the ROS network."""
         self._alarm.close()
 
     def declare(self, name: str, role: int | str, endpoints: Collection[Registered]) -> None:
@@ -136,7 +136,7 @@ class Registrations:
             self.declare(name, role, endpoints)
 
     def _note_alone(self) -> None:
-        """Note whether there is no endpoint, which makes the module a ROS node after a second."""
+        """Note whether the link has endpoints: after a second without any, the module itself becomes a ROS node."""
         if self._at_once:
             self._alone = not self._counts
         elif self._counts:
@@ -203,7 +203,7 @@ class NotOnRos:
             in_background(self._loop.call_later(_REPORTED_AFTER_S, self._report, name))
 
     def close(self) -> None:
-        """Report nothing more."""
+        """Stop reporting."""
         self._closed = True
 
     def _report(self, name: str) -> None:

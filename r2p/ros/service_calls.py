@@ -316,7 +316,7 @@ class RosRequests:
         self._set_alarm()
 
     def _transmit(self, request: _OpenRequest) -> None:
-        """Send a request, or its cancellation; again after a while, unless nothing gets lost on the way."""
+        """Send a request, or its cancellation, and schedule its repetition on links that may lose it."""
         service, body = request.service, request.body
         if request.kind is Kind.CANCEL:
             request.tries -= 1

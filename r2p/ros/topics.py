@@ -54,7 +54,7 @@ def is_own(topic: str) -> bool:
 
 
 def is_of_action(name: str) -> bool:
-    """Return whether a topic or a service is a part of an action, which ROS 1 has none of."""
+    """Return whether a topic or a service is a part of an action. ROS 1 has no actions."""
     return "/_action/" in name
 
 
@@ -194,7 +194,7 @@ Fill = Callable[[Sample], Message | None]
 
 
 def _header_stamps(shape: Layout[Any], counts: Counter[str]) -> Fill:
-    """Return what fills `header.stamp` of messages that have none of their own, or one of another clock."""
+    """Return the filler of `header.stamp` for messages without a stamp of their own, or with one of another clock."""
     source = StampSource(shape.cls, counts)
 
     def fill(sample: Sample) -> Any:

@@ -86,7 +86,7 @@ def service() -> RosService:
 
 
 def describe(request: bytes, classes: Iterable[type[Message]]) -> bytes:
-    """Return the answer to a request: the description of a type of one of these classes, or why there is none.
+    """Return the answer to a request: the description of a type of one of these classes, or the reason for a failure.
 
     Raises DecodeError for what is not a request.
     """

@@ -378,7 +378,7 @@ class ServiceClient(Generic[Q, R]):
             self._send_cancel(call)
 
     def _send_cancel(self, call: Call) -> None:
-        """Send a cancellation; again after a while, unless nothing gets lost on the way, or often enough."""
+        """Send a cancellation, and repeat it a few times on links that may lose it."""
         self._transmit(call, Kind.CANCEL, b"", _FIRST_MAX)
         call.tries -= 1
         if not call.tries or (call.target is not None and call.target.lossless):

@@ -104,7 +104,7 @@ class HandlerOwner(abc.ABC):
 
     @abc.abstractmethod
     def stop(self, reason: str) -> list[asyncio.Task[None]]:
-        """Accept nothing more and cancel all handlers; return the tasks of those that still clean up."""
+        """Reject new requests and cancel all handlers; return the tasks of those that still clean up."""
 
     @abc.abstractmethod
     def close(self) -> None:

@@ -83,7 +83,7 @@ class Outlet(SporadicPublisher[Any]):
         return self._topic
 
     def send(self, data: bytes, lifetime: int) -> None:
-        """Publish a packed message that is worth nothing after `lifetime` (ns)."""
+        """Publish a packed message that expires after `lifetime` (ns)."""
         self.sent = sequence = self.sent + 1
         stamp = self._now()
         sample = Sample(data, self._source, stamp, stamp + lifetime, sequence, PublisherClass.SPORADIC)

@@ -239,7 +239,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._run_real_timers()
 
     def _idle(self) -> float | None:
-        """Jump to the next timer: nothing is left to do at this instant. Return for how long to wait, None: for events.
+        """Jump to the next timer, when this instant is done. Return the seconds to wait; None: until an event.
 
         With a free clock, only jobs in threads are waited for.
         """

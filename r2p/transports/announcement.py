@@ -1,6 +1,6 @@
-"""What a link announces of a topic of this module."""
+"""What a link announces of a topic of this module, and what a gateway changes of that."""
 
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -8,6 +8,7 @@ from r2p.codecs.management import ANY_TYPE, CLASS_LATCHES, NO_PARAMS, QUEUE, ROL
 from r2p.messages import Layout
 from r2p.protocols.discovery.directory import TopicInfo
 from r2p.protocols.discovery.events import TopicType, describe_mismatch
+from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic
 
 
@@ -30,6 +31,33 @@ class Announcement(msgspec.Struct, frozen=True):
 
 
 NOTHING = Announcement()
+
+
+class GatewayHooks(Protocol):
+    """Decisions about one link: by its gateway, or by a module with several links to networks that gateways join."""
+
+    def handle_management(self, data: bytes) -> bool:
+        """Handle a management message before discovery does; return True if it concerns gateways only."""
+
+    def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
+        """Return what the other ends should know of a topic: `own`, and the demand of other links."""
+
+    @property
+    def may_announce(self) -> bool:
+        """Return whether discovery may send: of two links that lead to one network, only one announces."""
+
+    @property
+    def has_other_gateways(self) -> bool:
+        """Return whether there are other gateways on the link's network."""
+
+    def types_elsewhere(self, topic: str) -> tuple[TopicType, TopicType]:
+        """Return the types in which a topic of the link is published, and subscribed, on the gateway's other links."""
+
+    def source_name(self, source: Source) -> str:
+        """Return the name of a message's module, as it is on the link's network."""
+
+    def discovery_changed(self) -> None:
+        """Adapt to changes in discovery."""
 
 
 def type_of(topic: Topic) -> TopicType:

@@ -33,7 +33,6 @@ from r2p.protocols.discovery.events import (
     Send,
     SubscriberJoined,
     SubscribersGone,
-    TopicType,
     possible_senders,
 )
 from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
@@ -41,7 +40,13 @@ from r2p.protocols.keys import LinkEnd
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic
-from r2p.transports.announcement import NOTHING, Announcement, announcement_of, refused_publishers
+from r2p.transports.announcement import (
+    NOTHING,
+    Announcement,
+    GatewayHooks,
+    announcement_of,
+    refused_publishers,
+)
 from r2p.transports.call_channel import CallChannel, CallHub
 from r2p.transports.guard import GuardedHub, LinkGuard, key_protocol
 from r2p.transports.stats import RETRY_AFTER_ERROR, LinkStats, LoggedCounter
@@ -92,33 +97,6 @@ class Hub(GuardedHub, CallHub, Protocol):
 
     async def message_type(self, fingerprint: bytes, topic: str) -> type[Message] | None:
         """Ask other modules for a message class of this layout: that of the topic, where several have it."""
-
-
-class GatewayHooks(Protocol):
-    """Decisions about one link: by its gateway, or by a module with several links to networks that gateways join."""
-
-    def handle_management(self, data: bytes) -> bool:
-        """Handle a management message before discovery does; return True if it concerns gateways only."""
-
-    def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
-        """Return what the other ends should know of a topic: `own`, and the demand of other links."""
-
-    @property
-    def may_announce(self) -> bool:
-        """Return whether discovery may send: of two links that lead to one network, only one announces."""
-
-    @property
-    def has_other_gateways(self) -> bool:
-        """Return whether there are other gateways on the link's network."""
-
-    def types_elsewhere(self, topic: str) -> tuple[TopicType, TopicType]:
-        """Return the types in which a topic of the link is published, and subscribed, on the gateway's other links."""
-
-    def source_name(self, source: Source) -> str:
-        """Return the name of a message's module, as it is on the link's network."""
-
-    def discovery_changed(self) -> None:
-        """Adapt to changes in discovery."""
 
 
 class Transport(abc.ABC):

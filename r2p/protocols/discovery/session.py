@@ -148,7 +148,7 @@ class DiscoveryProtocol(ABC):
         return []
 
     def topics_with_alias(self, alias: str) -> set[str]:
-        """Return the topics that are known to have this alias; several can't be told apart on this link."""
+        """Return the known topics with this alias; if there are several, this link can't distinguish them."""
         return set()
 
     def rival(self, topic: str) -> str:

@@ -249,7 +249,7 @@ class SlotRequests:
             self.schedule(now, each)
 
     def pause(self, now: int, reason: str) -> None:
-        """Suspend all slots, as there is no master."""
+        """Suspend all slots while the bus has no master."""
         self.has_master = False
         for each in self._periodics.values():
             self.suspend(now, each, reason)

@@ -213,12 +213,12 @@ class SlotTransmitter:
     # Messages
 
     def withdraw_network(self, id8: int) -> None:
-        """Drop a waiting NETWORK, which is no longer true."""
+        """Drop a NETWORK message in the queue, because it is out of date."""
         message = rtcan.message_id(rtcan.MANAGEMENT, id8)
         self.queue.withdraw(message, lambda each: type_of(each.payload) == ManagementType.NETWORK)
 
     def forget(self, periodic: PeriodicMessage) -> None:
-        """Send nothing more of a periodic message that has ended."""
+        """Stop sending a periodic message that has ended."""
         self.plan.invalidate()
         if self.mailboxes.boxes[_HRT] is periodic:  # it may be on the bus: the port still has to confirm it
             self.mailboxes.boxes[_HRT] = _DISCARDED
@@ -248,7 +248,7 @@ class SlotTransmitter:
         self.mailboxes.put(_SYNC, frame, _HRT, start, last)
 
     def send_first_sync(self, first: FirstSync) -> bool:
-        """Send a new master's first sync, which may be late, as there are no slots yet. Return False if it can't."""
+        """Send a new master's first sync, which may be late because no slots exist yet. Return False if it can't."""
         if self.mailboxes.boxes[_HRT] is not None:
             return False
         self.mailboxes.put(first, first.frame, _HRT, first.start, NEVER)

@@ -113,7 +113,7 @@ class DdsSample(msgspec.Struct, frozen=True, gc=False):
 
 
 class DdsEvents(msgspec.Struct):
-    """What the thread has found in one go, in order of this: who is there, whom endpoints fit, and what they got."""
+    """One batch of the thread's findings, in this order: participants and endpoints, matches, and received messages."""
 
     found: list[tuple[DdsEndpoint, bool]] = msgspec.field(default_factory=list)
     """Endpoints of others, and whether they write."""

@@ -40,7 +40,7 @@ _ADMITTED = "connection not admitted"
 
 
 class Ros1Context:
-    """What all connections of a middleware share: its user, its counters, and who has no room."""
+    """State shared by all connections of a middleware: its user, its counters, and the subscribers without room."""
 
     user: MiddlewareUser
 
@@ -96,7 +96,7 @@ class Ros1Context:
         self.without_room.add(connection)
 
     def unblock(self, connection: object) -> None:
-        """Note that a subscriber has room again, or is not waited for any more."""
+        """Note that a subscriber has room again, or that publishers stop waiting for it."""
         if connection in self.without_room:
             self.without_room.remove(connection)
             if not self.without_room:
@@ -175,7 +175,7 @@ class TcprosConnection(asyncio.Protocol):
             self.on_failure("the connection was closed before its header")
 
     def end_wait(self) -> None:
-        """Wait for no header any more."""
+        """Cancel the time-out for the header."""
         if self._deadline is not None:
             self._deadline.cancel()
             self._deadline = None
@@ -312,7 +312,7 @@ class TcprosListener:
         return found.accept(fields, connection)
 
     def known_name(self, fields: Fields) -> str:
-        """Return the topic or service of this node that a header asks for; empty if it has none of that name."""
+        """Return the topic or service of this node that a header asks for, or an empty text."""
         name = fields.get("service", fields.get("topic", ""))
         return name if name in self.services or name in self.topics else ""
 

@@ -71,11 +71,11 @@ class MasterClient:
     # What there is
 
     async def lookup_node(self, node: str, name: str) -> str:
-        """Return the slave URI of a node. Raises MasterError if there is none."""
+        """Return the slave URI of a node. Raises MasterError for an unknown node."""
         return str(await self.call("lookupNode", node, name))
 
     async def lookup_service(self, node: str, service: str) -> str:
-        """Return the URI of a service, `rosrpc://host:port`. Raises MasterError if there is none."""
+        """Return the URI of a service, `rosrpc://host:port`. Raises MasterError for an unknown service."""
         return str(await self.call("lookupService", node, service))
 
     async def get_system_state(self, node: str) -> SystemState:

@@ -248,7 +248,7 @@ class Ros1Middleware(Middleware):
             subscription.update(publishers)
 
     async def _ask_keepalive(self) -> None:
-        """Do without keep-alive on further connections if the parameter /tcp_keepalive says so."""
+        """Disable keep-alive on new connections if the parameter /tcp_keepalive is false."""
         backoff = Backoff(self._context.random)
         while True:
             try:

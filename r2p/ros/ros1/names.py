@@ -47,7 +47,7 @@ def resolve(name: str, node: str) -> str:
 
 
 class RosArguments(msgspec.Struct, frozen=True):
-    """What ROS's arguments of a program say; `special` are the words with two underscores, without those."""
+    """The parsed ROS arguments of a program; `special` has those like `__name:=`, without the underscores."""
 
     remappings: Mapping[str, str]
     parameters: Mapping[str, object]
@@ -66,7 +66,7 @@ class RosArguments(msgspec.Struct, frozen=True):
 
 
 def arguments(argv: Iterable[str]) -> tuple[RosArguments, list[str]]:
-    """Return what arguments like `from:=to` say, and the other arguments. Raises InvalidName for a wrong name."""
+    """Parse arguments like `from:=to`; return them and the remaining arguments. Raises InvalidName for a wrong name."""
     remappings: dict[str, str] = {}
     parameters: dict[str, object] = {}
     special: dict[str, str] = {}
@@ -100,7 +100,7 @@ def _checked(name: str, text: str) -> str:
 
 
 def _parsed(value: str) -> object:
-    """Return what a value in YAML says, as `rosparam set` reads it."""
+    """Parse a value in YAML, as `rosparam set` does."""
     try:
         return yaml.safe_load(value)
     except yaml.YAMLError:

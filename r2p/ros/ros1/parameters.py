@@ -128,7 +128,7 @@ class ParameterMirror:
         return f"{self._node_name(module, name[0])}/{name[1].replace('.', '/')}"
 
     def _clash(self, key: str) -> str:
-        """Return the key of a parameter that is a namespace of this one, or in it; empty if there is none."""
+        """Return the key of a parameter that is a namespace of this one, or in it, or an empty text."""
         return next(
             (each for each in self._mirrored if f"{key}/".startswith(f"{each}/") or each.startswith(f"{key}/")), ""
         )

@@ -83,7 +83,7 @@ class SubscriberConnection(TcprosConnection):
         return not self._paused or ((not depth or len(self._queue) < depth) and self._queued < QUEUE_BYTES_MAX)
 
     def data_received(self, data: bytes) -> None:
-        """Ignore what comes: subscribers have nothing more to say."""
+        """Ignore received bytes: subscribers send only a header."""
 
     def pause_writing(self) -> None:
         self._paused = True

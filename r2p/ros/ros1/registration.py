@@ -99,7 +99,7 @@ class MasterSession:
     # What nodes have
 
     def add_node(self, node: str) -> None:
-        """Give a node its slave server. Nothing for one that exists. Raises TransportError if there is no port."""
+        """Start the slave server of a node, unless it exists. Raises TransportError without a free port."""
         if node in self._nodes:
             return
         self._nodes[node] = slave = SlaveNode(node, self)
@@ -324,7 +324,7 @@ class MasterSession:
             self._user.graph_changed(graph)
 
     async def _find_lost(self, entry: _MasterEntry, state: SystemState) -> None:
-        """Find out why the master does not know a registration any more; register it again if no other node has it."""
+        """Find out why the master has lost a registration; register it again unless another node has taken it."""
         if entry not in self._registered:
             return
         if entry.kind == "service" and (others := state.services.get(entry.name)):
@@ -421,7 +421,7 @@ class MasterSession:
         self._user.middleware_up()
 
     def _note_gone(self, error: Exception) -> None:
-        """Say once that there is no master, or none any more: then connections go on, so the link stays up."""
+        """Report once that the master does not answer. Open connections go on without it, so the link stays up."""
         self.client.close()
         self._poll_at = 0.0
         reason = _reason(self.address.master, error)
@@ -495,7 +495,7 @@ def _reason(uri: str, error: Exception) -> str:
 
 
 def _is_known(entry: _MasterEntry, state: SystemState) -> bool:
-    """Return whether the master has a registration; it does not say whether parameters are subscribed."""
+    """Return whether the master has a registration. It can't be asked for subscriptions of parameters."""
     tables = {"publisher": state.publishers, "subscriber": state.subscribers, "service": state.services}
     table = tables.get(entry.kind)
     return table is None or entry.node in table.get(entry.name, ())

@@ -16,8 +16,8 @@ from r2p.ros.ros1.connections import Ros1Context, TcprosConnection, take_over
 from r2p.ros.ros1.tcpros import (
     MESSAGE_MAX,
     Fields,
-    Response,
     ResponseReader,
+    TcprosResponse,
     caller_header,
     encode_failure,
     encode_header,
@@ -186,7 +186,7 @@ class Ros1ServerConnection(TcprosConnection):
         self.expires: asyncio.TimerHandle | None = None
         """The timer that closes the connection while no call uses it."""
         self._responses = ResponseReader()
-        self._response: asyncio.Future[Response] | None = None
+        self._response: asyncio.Future[TcprosResponse] | None = None
 
     async def request(self, data: bytes) -> bytes:
         """Return the response to a request. Raises ServiceError."""
@@ -279,7 +279,7 @@ class Ros1Callers:
         return RosService(fields.get("type", ""), fields.get("md5sum", ""))
 
     def forget(self, service: str) -> None:
-        """Close the connections that are kept for a service: nothing serves it now."""
+        """Close the idle connections to a service without a server."""
         for key in [key for key in self._idle if key[1] == service]:
             for connection in self._idle.pop(key):
                 connection.close()

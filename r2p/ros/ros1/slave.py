@@ -149,7 +149,7 @@ class SlaveNode:
         return [_OK, "bus info", rows]
 
     def get_bus_stats(self, _caller: str) -> object:
-        """Return what rospy returns: connections of publishers, of subscribers, and nothing of services."""
+        """Return the statistics of publishers and subscribers; those of services are empty, as in rospy."""
         connections = [*self._owner.slaves.connections(self.name)]
         return [_OK, "", [self._published(connections), self._subscribed(connections), []]]
 
@@ -223,7 +223,7 @@ _METHODS: Final = {
 
 
 def _problem(method: _Method, arguments: list[Value]) -> str:
-    """Return what is wrong with the arguments of a call, as rospy says it; empty if nothing is."""
+    """Return the fault in the arguments of a call, in rospy's words; empty for valid ones."""
     if not arguments:
         return "missing required caller_id parameter"
     caller, *others = arguments

@@ -156,7 +156,7 @@ class FrameReader:
         self._rest.clear()
 
 
-class Response(NamedTuple):
+class TcprosResponse(NamedTuple):
     """A server's response: its bytes, or the text of an error."""
 
     ok: bool
@@ -171,10 +171,10 @@ class ResponseReader:
         """The reason why nothing is read any more; empty while all is well."""
         self._rest = bytearray()
 
-    def feed(self, data: bytes) -> list[Response]:
+    def feed(self, data: bytes) -> list[TcprosResponse]:
         """Return all responses that are complete now, in order."""
         self._rest += data
-        found: list[Response] = []
+        found: list[TcprosResponse] = []
         while not self.broken and len(self._rest) >= _RESPONSE.size:
             ok, size = _RESPONSE.unpack_from(self._rest)
             if size > MESSAGE_MAX or ok > 1:
@@ -184,7 +184,7 @@ class ResponseReader:
             end = _RESPONSE.size + size
             if len(self._rest) < end:
                 break
-            found.append(Response(bool(ok), bytes(self._rest[_RESPONSE.size : end])))
+            found.append(TcprosResponse(bool(ok), bytes(self._rest[_RESPONSE.size : end])))
             del self._rest[:end]
         return found
 

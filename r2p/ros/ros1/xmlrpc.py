@@ -45,7 +45,7 @@ _SHOWN: Final = 300  # characters of another program's text in an error
 
 
 class XmlRpcError(Error):
-    """A call that the other end answered with a fault, or with what is not XMLRPC; the text says which call."""
+    """A call that the other end answered with a fault or with invalid XMLRPC; the text names the call."""
 
 
 Handler = Callable[[str, list[Value]], object]
@@ -137,7 +137,7 @@ class XmlRpcClient:
                 connection.close()
 
     def local_host(self, uri: str) -> str:
-        """Return the address of this end of the connection to a server that is kept; empty if there is none now."""
+        """Return the local address of the open connection to the server; empty without one."""
         connection = self._kept.get(uri)
         return connection.local_host() if connection is not None else ""
 

@@ -259,7 +259,7 @@ class Ros2Middleware(Middleware):
             self._session.later(functools.partial(self._close_unused, subscription, _index(endpoint)))
 
     def _close_unused(self, subscription: RmwSubscription, index: tuple[str, str, str]) -> None:
-        """Close a subscription unless another subscriber has joined it: one that differs in its QoS misses nothing."""
+        """Close a subscription unless another subscriber has joined it meanwhile, as at a change of QoS."""
         if not subscription.tokens and self._subscriptions.get(index) is subscription:
             del self._subscriptions[index]
             subscription.close()

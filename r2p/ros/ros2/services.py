@@ -269,7 +269,7 @@ class RmwClient:
                 session.requests.submit(ends.cancel)
 
     def _on_reply(self, reply: zenoh.Reply | None, sequence: int, done: "asyncio.Future[bytes | None]") -> None:
-        """Handle a reply, or None: there are no more."""
+        """Handle a reply; None ends the query."""
         if done.done():
             return
         if reply is None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from r2p.codecs.can_bits import Frame
-    from r2p.sim.can.controller import ControllerMailboxes, Request
+    from r2p.sim.can.controller import ControllerMailboxes, TransmitRequest
 
 _FLAG: Final = 6  # bits of an error flag
 _DELIMITER: Final = 8  # recessive bits that end an error frame
@@ -40,7 +40,7 @@ class _Transfer(msgspec.Struct, eq=False):
     """A frame on the wire: its senders, its receivers, and whether an error frame will end it."""
 
     frame: Frame
-    requests: list[Request]
+    requests: list[TransmitRequest]
     names: tuple[str, ...]
     receivers: Sequence[CanController]
     start: int
@@ -116,7 +116,7 @@ class CanBus(BusWire):
 
     # For controllers: `BusWire` says what these do
 
-    def contend(self, request: Request) -> bool:
+    def contend(self, request: TransmitRequest) -> bool:
         mailboxes = request.owner.mailboxes
         self._contenders[mailboxes] = None
         if self._busy:
@@ -132,7 +132,7 @@ class CanBus(BusWire):
             self._plan_start(start)
         return True
 
-    def is_starting(self, request: Request) -> bool:
+    def is_starting(self, request: TransmitRequest) -> bool:
         start = self._start
         if start is None or self.timeline.now() < max(start, request.ready):
             return False
@@ -194,7 +194,7 @@ class CanBus(BusWire):
                 return
         self._send(contestants, start)
 
-    def _contestants(self, start: int, end: int) -> list[Request]:
+    def _contestants(self, start: int, end: int) -> list[TransmitRequest]:
         """Return one frame of each controller that takes part; `end` is one bit after the start of frame."""
         contestants = []
         for mailboxes in self._contenders:
@@ -205,7 +205,7 @@ class CanBus(BusWire):
                 mailboxes.watch_others(request)
         return contestants
 
-    def _winners(self, contestants: list[Request], start: int) -> list[Request]:
+    def _winners(self, contestants: list[TransmitRequest], start: int) -> list[TransmitRequest]:
         """Return the frames with the lowest identifier; the others lose at the bit where they differ from it."""
         lowest = min([request.frame.id for request in contestants])
         for request in contestants:
@@ -217,7 +217,7 @@ class CanBus(BusWire):
 
     # A frame
 
-    def _send(self, requests: list[Request], start: int, excluded: Sequence[CanController] = ()) -> None:
+    def _send(self, requests: list[TransmitRequest], start: int, excluded: Sequence[CanController] = ()) -> None:
         """Put a frame on the wire, of one sender or of several that send the same."""
         self._transfer = transfer = self._transfer_of(requests, start, excluded)
         end = start + transfer.bits * self.bit
@@ -230,7 +230,7 @@ class CanBus(BusWire):
         else:
             self._destroy(transfer, wire_bits(transfer.frame)[:-_BITS_AFTER_ACK], ErrorKind.ACK, transfer.owners)
 
-    def _transfer_of(self, requests: list[Request], start: int, excluded: Sequence[CanController]) -> _Transfer:
+    def _transfer_of(self, requests: list[TransmitRequest], start: int, excluded: Sequence[CanController]) -> _Transfer:
         frame, owner = requests[0].frame, requests[0].owner
         if len(requests) == 1 and not excluded:
             names, receivers = self._listeners.audience[owner]
@@ -285,7 +285,7 @@ class CanBus(BusWire):
                 transfer.receivers = [each for each in transfer.receivers if each is not node]
         return False
 
-    def _collide(self, requests: list[Request], start: int, excluded: Sequence[CanController] = ()) -> None:
+    def _collide(self, requests: list[TransmitRequest], start: int, excluded: Sequence[CanController] = ()) -> None:
         """Let senders of one identifier collide: at the first bit that differs, those that send a 1 see an error."""
         wires = [wire_bits(request.frame) for request in requests]
         bit = first_difference(wires)

@@ -42,10 +42,10 @@ class BusWire(Protocol):
     timeline: Timeline
     bit: int
 
-    def contend(self, request: Request) -> bool:
+    def contend(self, request: TransmitRequest) -> bool:
         """Send this frame as soon as the bus is free. False: the bus is busy, or the frame would start too late."""
 
-    def is_starting(self, request: Request) -> bool:
+    def is_starting(self, request: TransmitRequest) -> bool:
         """Return whether the start bit of this frame has begun, and arbitration is still open."""
 
     def replan(self) -> None:
@@ -130,7 +130,7 @@ class CanController:
             if ahead > given:
                 given = ahead
         last = NEVER if not_after is None else clock.true(not_after + 1) - 1
-        self._put(Request(self, frame, mailbox, given + self._transmit_delay(), last))
+        self._put(TransmitRequest(self, frame, mailbox, given + self._transmit_delay(), last))
         return True
 
     def abort(self, mailbox: int = 0) -> bool:
@@ -216,14 +216,14 @@ class CanController:
         else:
             self._interrupts.deliver(end, self.on_receive, frame)
 
-    def complete(self, request: Request, end: int) -> None:
+    def complete(self, request: TransmitRequest, end: int) -> None:
         """Complete this request: its frame was acknowledged."""
         if self.confinement.transmit:
             self.confinement.count(transmit=-1)
         if self.mailboxes.remove(request):
             self._interrupts.deliver(end, self.on_sent, request.frame)
 
-    def lose_arbitration(self, request: Request, at: int) -> None:
+    def lose_arbitration(self, request: TransmitRequest, at: int) -> None:
         """Note that the frame of this request loses arbitration, at this instant."""
         request.busy_until = at
         if self.node.one_shot and request.mailbox != _BABBLE:
@@ -232,7 +232,7 @@ class CanController:
         elif request.last_start < NEVER:
             self._watch(request)
 
-    def fail(self, request: Request, kind: ErrorKind, at: int) -> None:
+    def fail(self, request: TransmitRequest, kind: ErrorKind, at: int) -> None:
         """Note that the frame of this request was destroyed: an error frame begins."""
         # The standard's exception: a node that is alone on the bus stays error passive, and never goes to bus-off.
         alone = kind is ErrorKind.ACK and self.confinement.passive
@@ -254,7 +254,7 @@ class CanController:
 
     # Inside
 
-    def _put(self, request: Request) -> None:
+    def _put(self, request: TransmitRequest) -> None:
         frame = request.frame
         if frame.id >> IDENTIFIER_BITS or len(frame.data) > FRAME_MAX:
             raise MessageError(
@@ -268,7 +268,7 @@ class CanController:
     def _is_wanted(self, identifier: int) -> bool:
         return not self._filters or any(identifier & mask == value for value, mask in self._filters)
 
-    def _watch(self, request: Request) -> None:
+    def _watch(self, request: TransmitRequest) -> None:
         """Abort the frame after its last start, if it still waits then."""
         # One event for each frame at most, and none for a frame that starts at once: most have a last start.
         if not request.watched and request.ready < NEVER:
@@ -290,7 +290,7 @@ class CanController:
             if self.node.recovery:
                 self._bus.recover(self)
 
-    def _withdraw(self, request: Request) -> bool:
+    def _withdraw(self, request: TransmitRequest) -> bool:
         """Empty the mailbox, unless the frame is on the wire or about to be."""
         if (
             self._timeline.now() < request.busy_until
@@ -301,18 +301,18 @@ class CanController:
         self._bus.replan()
         return True
 
-    def _lost(self, request: Request, stamp: int) -> None:
+    def _lost(self, request: TransmitRequest, stamp: int) -> None:
         if self.mailboxes.remove(request):  # only now: one event less for each loss, and software can't tell
             self.on_lost(request.frame, stamp)
 
-    def _late(self, request: Request, stamp: int) -> None:
+    def _late(self, request: TransmitRequest, stamp: int) -> None:
         request.watched = False  # a frame that has started and is not sent in the end is watched again
         if self._withdraw(request):
             self.on_late(request.frame, stamp)
 
     def _babble(self) -> None:
         if self._babbled and self.live:
-            self._put(Request(self, self._babbled, _BABBLE, self._timeline.now(), NEVER))
+            self._put(TransmitRequest(self, self._babbled, _BABBLE, self._timeline.now(), NEVER))
 
 
 class Confinement:
@@ -356,7 +356,7 @@ class Confinement:
             self.enter(ControllerState.PASSIVE if passive else ControllerState.ACTIVE)
 
 
-class Request(msgspec.Struct, eq=False):
+class TransmitRequest(msgspec.Struct, eq=False):
     """A frame in a mailbox of the controller `owner`.
 
     All instants are true time, in ns: the controller tries to send it from `ready` on; it starts by `last_start` or
@@ -378,14 +378,14 @@ class ControllerMailboxes:
     `watch` is called with frames that may have to be aborted at their last start.
     """
 
-    def __init__(self, watch: Callable[[Request], None]) -> None:
-        self.requests: dict[int, Request] = {}
+    def __init__(self, watch: Callable[[TransmitRequest], None]) -> None:
+        self.requests: dict[int, TransmitRequest] = {}
         """The frames, by mailbox."""
         self.not_before = 0
         """The controller starts no frame before this instant."""
         self._watch = watch
 
-    def choose(self, start: int, end: int) -> Request | None:
+    def choose(self, start: int, end: int) -> TransmitRequest | None:
         """Return the frame that takes part in an arbitration from `start` on; `end` is one bit later.
 
         Of the frames ready by then it is the one with the lowest identifier, otherwise the first to be ready by `end`:
@@ -419,7 +419,7 @@ class ControllerMailboxes:
                 earliest = begins
         return earliest
 
-    def watch_others(self, chosen: Request | None) -> None:
+    def watch_others(self, chosen: TransmitRequest | None) -> None:
         """Watch all frames but `chosen`: another frame has started, and they may become too late."""
         for request in self.requests.values():
             if request.last_start < NEVER and request is not chosen:
@@ -431,7 +431,7 @@ class ControllerMailboxes:
         self.requests.clear()
         return frames
 
-    def remove(self, request: Request) -> bool:
+    def remove(self, request: TransmitRequest) -> bool:
         """Empty the mailbox of this request. False: it is no longer there, or the node babbles and sends it again."""
         mailbox = request.mailbox
         if mailbox == _BABBLE or self.requests.get(mailbox) is not request:

@@ -100,7 +100,7 @@ class BusReporter:
         return wanted if now - self._wanted_since >= len(ahead) * _TURN else set()
 
     def _is_other_topic(self, topic: str) -> bool:
-        """Return whether others use the name for messages of another type: it is no business of this one."""
+        """Return whether others use the name for messages of another type, so that this module must not publish it."""
         own = layout(_TYPES[topic]).fingerprint
         here = self._space.topics.get(topic)
         known = [here.layout.fingerprint] if here is not None and here.layout is not None else []
@@ -111,7 +111,7 @@ class BusReporter:
     # Publishing
 
     async def _publish(self) -> None:
-        """Publish once a second, until it is no longer up to this module."""
+        """Publish once a second, until another module takes over."""
         try:
             await self._publish_while_wanted()
         except TypeMismatch as error:

@@ -169,7 +169,7 @@ class EngineDriver:
         self.port.set_filters(self.engine.filters() if self._monitor is None else None)
 
     def watch(self, monitor: Monitor | None) -> None:
-        """Let a monitor count what is on the bus from now on, instead of the one before; None: no longer."""
+        """Set the monitor that counts what is on the bus; None removes it."""
         self._monitor = monitor
         self._watched.clear()
         self._port_actions[Transmit] = self.port.transmit if monitor is None else self._transmit_watched

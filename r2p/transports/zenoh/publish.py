@@ -172,7 +172,7 @@ class Batcher:
         self._streams: dict[TxStream, None] = {}
 
     def add(self, stream: TxStream) -> None:
-        """Send soon: the stream is not empty any more, or full now."""
+        """Send soon: the stream has become non-empty, or full."""
         if not self._turn_begun:  # so a message that comes alone is not held up
             self._turn_begun = True
             self._loop.call_soon(self._end_turn)

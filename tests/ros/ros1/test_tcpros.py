@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from r2p.errors import DecodeError
 from r2p.ros.middleware import RosService, RosType
 from r2p.ros.ros1 import tcpros
-from r2p.ros.ros1.tcpros import FrameReader, Response, ResponseReader
+from r2p.ros.ros1.tcpros import FrameReader, ResponseReader, TcprosResponse
 
 NAMES = st.text(st.characters(exclude_characters="=", codec="utf-8"), min_size=1, max_size=20)
 HEADERS = st.dictionaries(NAMES, st.text(max_size=50), max_size=6)
@@ -48,7 +48,7 @@ def test_responses_in_any_pieces(responses: list[tuple[bool, str]], cuts: list[i
     )
     reader = ResponseReader()
     found = [response for piece in pieces(data, cuts) for response in reader.feed(piece)]
-    assert found == [Response(ok, text.encode()) for ok, text in responses]
+    assert found == [TcprosResponse(ok, text.encode()) for ok, text in responses]
 
 
 @given(st.lists(st.binary(max_size=60), max_size=5), st.integers(0, 80))
