@@ -15,6 +15,7 @@ PICTURE = Path(__file__).parent / "assets" / "architecture.svg"
 
 LAYERS: dict[str, tuple[str, ...]] = {
     "Commands, test tools": ("tools", "testing"),
+    "Recordings": ("recording",),
     "Simulation, boot loader, ROS": (
         "sim",
         "sim.can",

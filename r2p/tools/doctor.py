@@ -35,6 +35,7 @@ from r2p.transports.url import is_ros
 from r2p.units import MILLISECOND
 
 EXTRAS = {
+    "bag": "mcap",
     "can": "python-can",
     "dds": "cyclonedds",
     "elf": "pyelftools",

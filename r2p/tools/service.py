@@ -65,7 +65,7 @@ async def list_(session: Session, *, wait: Wait = None, format: Format = None) -
 
 @session.command(app, "info")
 async def info(session: Session, service: Name, *, wait: Wait = None, format: Format = None) -> None:
-    """Show the servers and clients of a service, and the fields of its types."""
+    """Show the servers, clients and types of a service."""
     output = Output(format)
     pairs, types = await _discover(session, wait)
     pair = pairs.get(topic_name(service))
