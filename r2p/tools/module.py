@@ -13,13 +13,13 @@ import typer
 
 import r2p
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, WIRE_VERSION
+from r2p.messages.values import to_plain
 from r2p.names import module_alias, module_path
 from r2p.tools import session
 from r2p.tools.completion import complete_module
 from r2p.tools.options import All, Format, Timeout, Wait
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, TimedOut, UsageError, alias_or_none, wait_until
-from r2p.tools.values import to_plain
 
 TIMEOUT = 10.0
 """Seconds in which a command must be confirmed: firmware with many topics sends ALIVE that rarely."""

@@ -27,6 +27,7 @@ from types import UnionType
 from typing import Any, Literal, TextIO
 
 from r2p.log_lines import StderrHandler, last_resort, printable, wrapped
+from r2p.messages.values import flatten
 
 Record = Mapping[str, Any]
 
@@ -208,24 +209,6 @@ async def wait_ready(fd: int, *, write: bool = False) -> None:
         await ready.wait()
     finally:
         remove(fd)
-
-
-def flatten(record: Record) -> dict[str, Any]:
-    """Return the leaves of a record by path: "stamp.sec", "value[0]"."""
-    leaves: dict[str, Any] = {}
-
-    def visit(path: str, value: Any) -> None:
-        if isinstance(value, Mapping):
-            for name, inner in value.items():
-                visit(f"{path}.{name}" if path else name, inner)
-        elif isinstance(value, list | tuple):
-            for i, inner in enumerate(value):
-                visit(f"{path}[{i}]", inner)
-        else:
-            leaves[path] = value
-
-    visit("", record)
-    return leaves
 
 
 def to_yaml(record: Any) -> str:

@@ -13,6 +13,7 @@ import typer
 import r2p
 from r2p.codecs.services import REQUESTS, RESPONSES, is_of_service
 from r2p.messages import Nested
+from r2p.messages.values import parse, to_plain
 from r2p.names import topic_name
 from r2p.services.definition import Definition, define
 from r2p.tools import session
@@ -22,7 +23,6 @@ from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, TimedOut, UsageError
 from r2p.tools.topic.list import endpoints_of
 from r2p.tools.types import LEARNT, Types, is_service, load_service, load_type
-from r2p.tools.values import parse, to_plain
 
 app = session.group("List, inspect and call services.")
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from r2p.tools.output import Output, PipeClosed, aligned, flatten
+from r2p.messages.values import flatten
+from r2p.tools.output import Output, PipeClosed, aligned
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

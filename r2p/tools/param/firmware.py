@@ -15,14 +15,14 @@ import typer
 
 import r2p
 from r2p.loader import InstalledApp, LoaderClient, LoaderSilent
+from r2p.messages.values import flatten, parse, pick, to_plain
 from r2p.tools.completion import complete_type
 from r2p.tools.module import unknown_module
-from r2p.tools.output import Output, flatten, notify
+from r2p.tools.output import Output, notify
 from r2p.tools.param.targets import similar
 from r2p.tools.param.texts import put_all
 from r2p.tools.session import Session, TimedOut, UsageError, wait_until
 from r2p.tools.types import Types, type_name
-from r2p.tools.values import parse, pick, to_plain
 
 App = Annotated[
     str | None,

@@ -10,14 +10,14 @@ import msgspec
 import typer
 
 import r2p
+from r2p.messages.values import META, Form, flatten, pick, to_plain
 from r2p.names import topic_name
 from r2p.tools.options import Count, Format, Once, Timeout
-from r2p.tools.output import Output, flatten, notify
+from r2p.tools.output import Output, notify
 from r2p.tools.session import REPORT_WAITING_AFTER, Session, UsageError, patience
 from r2p.tools.topic.filter import Filter, FilterError
 from r2p.tools.topic.watching import Topics, TypeName, advice, received_samples, while_publishers_fit
 from r2p.tools.types import Types, suggestion
-from r2p.tools.values import META, Form, pick, to_plain
 from r2p.units import SECOND
 
 QUEUE = 1024

@@ -21,7 +21,7 @@ from typing import Any
 
 from r2p.errors import Error
 from r2p.messages import Array, FixedArray, Layout, Message, Nested, Scalar, Shape, VariableArray, layout
-from r2p.tools.values import shortest_f32
+from r2p.messages.values import shortest_f32
 
 LENGTH_MAX = 1000
 """Characters of an expression."""

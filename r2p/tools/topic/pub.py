@@ -15,6 +15,7 @@ import typer
 import r2p
 from r2p.bridge import ClassOf
 from r2p.messages import SIZE_MAX
+from r2p.messages.values import parse, parse_line, to_plain
 from r2p.names import topic_name
 from r2p.tools.options import Count, Once, Rate, class_choice, time_option
 from r2p.tools.output import notify, wait_ready, waitable
@@ -31,7 +32,6 @@ from r2p.tools.topic.watching import (
     while_subscribers_fit,
 )
 from r2p.tools.types import find
-from r2p.tools.values import parse, parse_line, to_plain
 
 STDIN = "-"
 DEFAULT_RATE = 1.0

@@ -100,6 +100,24 @@ def to_plain(message: Message, form: Form = "whole") -> dict[str, Any]:
     return plain
 
 
+def flatten(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the leaves of a record by path: "stamp.sec", "value[0]"."""
+    leaves: dict[str, Any] = {}
+
+    def visit(path: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            for name, inner in value.items():
+                visit(f"{path}.{name}" if path else name, inner)
+        elif isinstance(value, list | tuple):
+            for i, inner in enumerate(value):
+                visit(f"{path}[{i}]", inner)
+        else:
+            leaves[path] = value
+
+    visit("", record)
+    return leaves
+
+
 def pick(message: Message, path: str, form: Form = "whole") -> Any:
     """Return the value at a path: `stamp.sec`, `value[0]`. None for an element that an array of this length lacks.
 

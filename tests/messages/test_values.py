@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import r2p
 from r2p import Array
+from r2p.messages.values import from_plain, parse, parse_line, pick, shortest_f32, to_plain
 from r2p.msg import (
     IMU,
     Header,
@@ -34,7 +35,6 @@ from r2p.msg import (
 from r2p.tools.output import to_yaml
 from r2p.tools.session import UsageError
 from r2p.tools.types import class_path, load_type, of_size, standard_types, type_name
-from r2p.tools.values import from_plain, parse, parse_line, pick, shortest_f32, to_plain
 from tests.messages.strategies import messages
 
 
