@@ -437,6 +437,11 @@ def _hint(value: object) -> str:
         return ""
 
 
+def local_time(now: int, form: str) -> str:
+    """Return a UTC instant (ns) as the local time of this computer, in a format of `time.strftime`."""
+    return time.strftime(form, time.localtime(now // SECOND))
+
+
 class Backoff:
     """Delays between tries, from `first` to `longest` seconds, doubling.
 

@@ -7,6 +7,7 @@ Read in this order:
     backpressure  waiting for room in a full queue or link
     queues        the bounded queues of subscribers, and the order of waking them
     topic         joins publishers, queues and links: `Topic.deliver` is the way of every message
+    immediate     subscriptions without a queue, whose messages are handled at once
     publishers/   one file for each class of publisher
     subscriber    reading a queue: `async for`, `fetch`, callbacks
     node          the first argument of a node's function

@@ -5,15 +5,15 @@ answer wakes its caller directly, a call costs no task, and a call from a handle
 for the task that it runs in.
 """
 
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from r2p.messages import Layout
 from r2p.runtime.backpressure import Sink
+from r2p.runtime.immediate import ImmediateSubscriber
 from r2p.runtime.publishers import SporadicPublisher
 from r2p.runtime.qos import Sporadic
-from r2p.runtime.queues import EndpointOwner, SubscriberQueue
+from r2p.runtime.queues import EndpointOwner
 from r2p.runtime.sample import DirectedSample, PublisherClass, Sample
 from r2p.runtime.topic import Topic, TopicSpace
 
@@ -21,42 +21,17 @@ PENDING_MAX = 64
 """Messages of one end that wait for room in a link; one more drops the oldest of them."""
 
 
-class _HandledAtOnce(deque[Sample]):
-    """The queue of an `Inlet`: always empty, as each message is handled when it comes."""
-
-    def __init__(self, handle: Callable[[Sample], None]) -> None:
-        super().__init__()
-        self.append = handle  # type: ignore[method-assign]
-
-
-class Inlet(SubscriberQueue):
+class Inlet(ImmediateSubscriber):
     """Subscribes to one topic of a service, and calls `handle` with each message."""
 
-    __slots__ = ("changed", "end", "space", "topic")
+    __slots__ = ("changed", "end")
 
     def __init__(self, space: TopicSpace, node: EndpointOwner, end: object, handle: Callable[[Sample], None]) -> None:
-        super().__init__(space.wake_scheduler, node, PENDING_MAX, lossy=False, keep_oldest=False)
-        self.queue = _HandledAtOnce(handle)
+        super().__init__(space, node, handle)
         self.end = end
         """The server or the client."""
         self.changed: Callable[[], None] = lambda: None
         """Callback when the topic gets a publisher."""
-        self.space = space
-        self.topic: Topic | None = None
-
-    def open(self, name: str, layout: Layout[Any]) -> Topic:
-        """Join the topic. Raises TypeMismatch if it has another type."""
-        self.topic = self.space.open(name, layout)
-        self.topic.join(self)
-        self.space.changed(self.topic)
-        return self.topic
-
-    def close(self) -> None:
-        """Leave the topic."""
-        if self.topic is not None:
-            topic, self.topic = self.topic, None
-            topic.leave(self)
-            self.space.release(topic)
 
     def publisher_joined(self) -> None:
         super().publisher_joined()

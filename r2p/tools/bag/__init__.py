@@ -1,0 +1,10 @@
+"""`r2p bag`: recordings of topics, CAN frames and what happened to them, in files.
+
+`record` writes a file.
+"""
+
+from r2p.tools import session
+from r2p.tools.bag import record
+
+app = session.group("Record topics to a file, and play, inspect and convert it.")
+session.command(app, "record", endless=lambda _given: True, check=record.check)(record.record)
