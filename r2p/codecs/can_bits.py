@@ -17,6 +17,20 @@ IDENTIFIER_BITS = 29
 INTERMISSION = 3  # bits between two frames
 TAIL = 10  # bits after the CRC, never stuffed: CRC delimiter, ACK slot, ACK delimiter, end of frame
 
+EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
+"""Flags above the 29 bits of an identifier, as in SocketCAN and in candump's logs: 29 bits, a remote frame, an error
+frame.
+"""
+
+IDENTIFIER_MASK = (1 << IDENTIFIER_BITS) - 1
+LOCAL = 0x4
+"""Flag MSG_DONTROUTE of SocketCAN's messages: a program of this computer sent the frame."""
+
+WireFrame: TypeAlias = tuple[int, bytes, int, int]
+"""A frame of any kind, as observers of a bus get it: its identifier with the flags above; its data, of a remote frame
+as many zeros as bytes that it asks for; flags such as LOCAL; and the instant of its end (ns).
+"""
+
 
 class Frame(msgspec.Struct, frozen=True, gc=False):
     """A data frame of CAN 2.0B: its 29-bit identifier and 0 to 8 bytes."""

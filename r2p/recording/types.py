@@ -9,8 +9,14 @@ from r2p.messages import Message, layout
 from r2p.messages.schemas import message_type
 from r2p.recording.format import ChannelInfo
 from r2p.ros.classes import definitions_of, standard_classes
-from r2p.ros.definitions import definition_text
+from r2p.ros.definitions import definition_text, parse
 from r2p.ros.type_names import ros2_name
+
+_TIMES = {
+    **parse("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n"),
+    **parse("builtin_interfaces/Duration", "int32 sec\nuint32 nanosec\n"),
+}
+"""What ROS 2 knows without its definition; a file has to say it."""
 
 
 class Ros2Schema(msgspec.Struct, frozen=True):
@@ -24,7 +30,7 @@ class Ros2Schema(msgspec.Struct, frozen=True):
 def schema_of(cls: type[Message]) -> Ros2Schema:
     """Return the schema of a message class. Raises MessageError for one that ROS 2 can't define."""
     name = layout(cls).name
-    return Ros2Schema(ros2_name(name), definition_text(name, definitions_of(cls, 2)))
+    return Ros2Schema(ros2_name(name), definition_text(name, _TIMES | definitions_of(cls, 2)))
 
 
 def class_of(info: ChannelInfo) -> type[Message] | None:

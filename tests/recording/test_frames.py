@@ -1,0 +1,100 @@
+"""Frames are the same after they have been in a bag, and other programs read them."""
+
+import struct
+from io import BytesIO
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from r2p.codecs.can_bits import ERROR, EXTENDED, LOCAL, REMOTE, WireFrame
+from r2p.errors import DecodeError
+from r2p.messages import Timestamp
+from r2p.msg import Header
+from r2p.recording.frames import BusInfo, CanFrame, FrameEntry, FrameWriter, RecordedFrame, bus_name, frame_of
+from r2p.recording.writer import BagWriter
+from r2p.ros.cdr import cdr
+
+UTC = 1_700_000_000_123_456_789
+
+
+@st.composite
+def wire_frames(draw: st.DrawFn) -> WireFrame:
+    """Frames of each kind, of either direction."""
+    kind = draw(st.sampled_from([0, EXTENDED, REMOTE, REMOTE | EXTENDED, ERROR]))
+    identifier = draw(st.integers(0, 0x7FF if kind in (0, REMOTE) else 0x1FFF_FFFF))
+    size = draw(st.integers(0, 8)) if kind != ERROR else 8
+    data = bytes(size) if kind & REMOTE else draw(st.binary(min_size=size, max_size=size))
+    return kind | identifier, data, draw(st.sampled_from([0, LOCAL])), draw(st.integers(0, 1 << 60))
+
+
+def written(bus: BusInfo, frames: list[WireFrame], offset: int = 0) -> BytesIO:
+    file = BytesIO()
+    writer = BagWriter(file)
+    FrameWriter(writer).write(FrameEntry(bus, frames, offset))
+    writer.finish()
+    file.seek(0)
+    return file
+
+
+@given(frames=st.lists(wire_frames(), max_size=20), name=st.text("abcdefgh_0", min_size=1, max_size=9))
+def test_frames_come_back(frames: list[WireFrame], name: str) -> None:
+    bus = BusInfo(name, f"rtcan:{name}", 500_000, 20, 10_000_000)
+    read = []
+    for _, channel, message in make_reader(written(bus, frames, 1000)).iter_messages(log_time_order=False):
+        assert BusInfo.from_metadata(channel.metadata) == bus
+        frame = frame_of(message.data, name, sent=channel.metadata["direction"] == "tx")
+        assert frame.time == message.log_time == message.publish_time
+        read.append(frame.wire)
+    assert read == [(identifier, data, flags, stamp + 1000) for identifier, data, flags, stamp in frames]
+
+
+@given(frame=wire_frames(), name=st.text("abcdefgh_0", max_size=9))
+def test_the_packed_frame_is_the_cdr_of_its_type(frame: WireFrame, name: str) -> None:
+    identifier, data, _, stamp = frame
+    ((_, _, message),) = make_reader(written(BusInfo(name), [frame])).iter_messages()
+    assert cdr(CanFrame).decode(message.data) == CanFrame(
+        Header(stamp=Timestamp.from_ns(stamp), frame_id=name),
+        identifier & 0x1FFF_FFFF,
+        bool(identifier & REMOTE),
+        bool(identifier & EXTENDED),
+        bool(identifier & ERROR),
+        len(data),
+        data.ljust(8, b"\0"),
+    )
+
+
+def test_mcap_ros2_support_reads_frames() -> None:
+    frames = [(EXTENDED | 0x1234567, b"abc", 0, 5), (REMOTE | 0x123, bytes(4), LOCAL, 6)]
+    reader = make_reader(written(BusInfo("can0"), frames, UTC), decoder_factories=[DecoderFactory()])
+    first, second = (each.decoded_message for each in reader.iter_decoded_messages(["/can0/frames"]))
+    assert (first.id, first.is_extended, first.dlc, bytes(first.data)) == (0x1234567, True, 3, b"abc\0\0\0\0\0")
+    assert (second.id, second.is_rtr, second.dlc, second.header.frame_id) == (0x123, True, 4, "can0")
+    assert first.header.stamp.sec * 10**9 + first.header.stamp.nanosec == UTC + 5
+
+
+@given(data=st.binary(max_size=80))
+def test_any_bytes_are_a_frame_or_refused(data: bytes) -> None:
+    for each in (data, b"\0\1\0\0" + data, b"\0\1\0\0" + bytes(8) + struct.pack("<I", 0xFFFF_FFF0) + data):
+        try:
+            frame = frame_of(each, "can0")
+        except DecodeError:
+            continue
+        assert isinstance(frame, RecordedFrame)
+
+
+@pytest.mark.parametrize("bad", ["", "x", "-1", "0", "9" * 5000, "٣"])
+def test_metadata_of_a_bus_that_can_not_be_is_refused(bad: str) -> None:
+    metadata = BusInfo("can0").metadata(sent=False)
+    with pytest.raises(DecodeError, match="bitrate"):
+        BusInfo.from_metadata(metadata | {"bitrate": bad})
+    assert BusInfo.from_metadata({}) is None
+
+
+@pytest.mark.parametrize(
+    ("address", "name"), [("can0", "can0"), ("slcan:/dev/ttyACM0", "slcan_dev_ttyACM0"), ("::", "can")]
+)
+def test_the_name_of_a_bus_is_one_of_ros(address: str, name: str) -> None:
+    assert bus_name(address) == name
