@@ -108,6 +108,8 @@ def _end_if_aligned(shape: Shape, at: int) -> int:
     match shape:
         case _ if at < 0 or not shape.size:
             return -1
+        case Nested(inner) if inner.name == _STAMPED:  # its `seq` is not in CDR
+            return -1
         case Nested(inner):
             return functools.reduce(lambda end, field: _end_if_aligned(field.shape, end), inner.fields, at)
         case FixedArray(item, count, "tuple"):
