@@ -1,26 +1,66 @@
-"""Writes the records of a bag: MCAP in chunks, with an index."""
+"""Makes the records of a bag: messages in compressed chunks with an index, and what stands before them.
 
+`BagWriter` writes them into a file at once, or, without one, leaves them in `ready` for `r2p.recording.disk`. The
+records of MCAP are those of the library `mcap`, except for messages and their index, of which there are too many.
+"""
+
+import struct
+import sys
+import zlib
+from array import array
+from collections import deque
 from collections.abc import Mapping
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
-from mcap.writer import CompressionType, Writer
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 
+from r2p.errors import DecodeError, MessageError
+from r2p.recording.bag_file import RECORD, BagFile, PackedChunk, message_index
 from r2p.recording.format import FORMAT, METADATA, PROFILE
 from r2p.version import __version__
 
 CHUNK_SIZE = 256 << 10
 """Bytes of messages that are compressed and indexed together."""
 
+ABOUT: Final = {"format": f"{FORMAT}", "r2p": __version__}
+"""What the metadata record `r2p` says."""
+
+_MESSAGE = struct.Struct("<BQHIQQ")  # a message's record up to its data: channel, sequence, log time, publish time
+_FIXED = _MESSAGE.size - RECORD.size
+_IDS_MAX = 0xFFFF
+
 
 class BagWriter:
-    """Writes a bag into a binary file. It waits for the disk: a program with an event loop has it in a thread."""
+    """Writes a bag. It waits for the disk: a program with an event loop has it in a thread.
 
-    def __init__(self, file: BinaryIO, *, chunk_size: int = CHUNK_SIZE) -> None:
-        """Begin the file."""
-        self._writer = Writer(file, chunk_size=chunk_size, compression=CompressionType.ZSTD)
-        self._writer.start(PROFILE, f"r2p {__version__}")
-        self._writer.add_metadata(METADATA, {"format": f"{FORMAT}", "r2p": __version__})
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
+    `registered` is what each file of a recording begins with: schemas, channels, metadata and attachments so far.
+    `ready` are the records and chunks that are not in a file yet: all, if there is no file.
+    """
+
+    def __init__(
+        self,
+        file: BinaryIO | None = None,
+        *,
+        chunk_size: int = CHUNK_SIZE,
+        about: Mapping[str, str] = ABOUT,
+        profile: str = PROFILE,
+    ) -> None:
+        """Begin the file. For a copy of another file, `about` is what its metadata record `r2p` says, if any."""
+        self.registered: list[McapRecord] = []
+        self.ready: deque[McapRecord | PackedChunk] = deque()
+        self.channels: dict[int, Channel] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._schema_ids: dict[tuple[str, str, bytes], int] = {}
+        self._chunk_size = chunk_size
+        self._compressor = zstandard.ZstdCompressor()
+        self._parts: list[bytes] = []
+        self._indexes: dict[int, list[int]] = {}
+        self._size = 0
+        self._file = BagFile(file, profile=profile) if file is not None else None
+        if about:
+            self.add_metadata(METADATA, about)
 
     def add_channel(
         self,
@@ -29,28 +69,114 @@ class BagWriter:
         metadata: Mapping[str, str],
         schema: tuple[str, str, bytes] | None = None,
     ) -> int:
-        """Begin a channel, and return its id. `schema`: its name, encoding and text; one that is known is shared."""
-        schema_id = 0
-        if schema is not None and not (schema_id := self._schemas.get(schema, 0)):
-            schema_id = self._schemas[schema] = self._writer.register_schema(*schema)
-        return self._writer.register_channel(topic, encoding, schema_id, dict(metadata))
+        """Begin a channel, and return its id. `schema`: its name, encoding and text; one that is known is shared.
+
+        Raises MessageError for more channels than a file can have.
+        """
+        schema_id = 0 if schema is None else self._schema(*schema)
+        channel = max(self.channels, default=0) + 1
+        if channel > _IDS_MAX:
+            raise MessageError(f"a recording has at most {_IDS_MAX} channels: no room for {topic}")
+        self._add_channel(Channel(channel, topic, encoding, dict(metadata), schema_id))
+        return channel
+
+    def _schema(self, name: str, encoding: str, text: bytes) -> int:
+        key = name, encoding, text
+        if key not in self._schema_ids:
+            self._add_schema(Schema(max(self._schemas, default=0) + 1, text, encoding, name))
+        return self._schema_ids[key]
+
+    def _add_schema(self, schema: Schema) -> None:
+        self._schemas[schema.id] = schema
+        self._schema_ids.setdefault((schema.name, schema.encoding, schema.data), schema.id)
+        self._register(schema)
+
+    def _add_channel(self, channel: Channel) -> None:
+        self.channels[channel.id] = channel
+        self._indexes[channel.id] = []
+        self._register(channel)
+
+    def copy_channel(self, channel: Channel, schema: Schema | None) -> None:
+        """Begin a channel of another file under the id that it has there, for `copy_chunk`.
+
+        Raises DecodeError if that id, or that of the schema, belongs to something else in this file.
+        """
+        if schema is not None and self._schemas.setdefault(schema.id, schema) != schema:
+            raise DecodeError(f"two schemas have the id {schema.id}")
+        if self.channels.get(channel.id, channel) != channel:
+            raise DecodeError(f"two channels have the id {channel.id}")
+        if schema is not None and schema not in self.registered:
+            self._add_schema(schema)
+        if channel.id not in self.channels:
+            self._add_channel(channel)
 
     def add(self, channel: int, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
         """Write a message; times in ns since 1970."""
-        self._writer.add_message(channel, log_time, data, publish_time, sequence)
+        head = _MESSAGE.pack(Opcode.MESSAGE, _FIXED + len(data), channel, sequence, log_time, publish_time)
+        size = self._size
+        self._indexes[channel] += (log_time, size)
+        self._parts += (head, data)
+        self._size = size = size + len(head) + len(data)
+        if size >= self._chunk_size:
+            self.end_chunk()
+
+    def copy_chunk(self, chunk: Chunk, index: bytes) -> None:
+        """Write a chunk of another file as it is, with the records of its index. Its channels are in this file.
+
+        Raises DecodeError for an index that is damaged, or has another channel.
+        """
+        copied = PackedChunk.make(chunk, index)
+        if unknown := copied.channels.keys() - self.channels.keys():
+            raise DecodeError(f"a chunk has messages of the unknown channel {min(unknown)}")
+        self.end_chunk()
+        self._append(copied)
 
     def attach(self, name: str, media_type: str, data: bytes, time: int) -> None:
         """Write an attachment, such as r2p.toml."""
-        self._writer.add_attachment(time, time, name, media_type, data)
+        self._register(Attachment(time, time, name, media_type, data))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        self._writer.add_metadata(name, dict(values))
+        self._register(Metadata(name, dict(values)))
+
+    def _register(self, record: McapRecord) -> None:
+        self.registered.append(record)
+        self._append(record)
+
+    def _append(self, item: McapRecord | PackedChunk) -> None:
+        self.ready.append(item)
+        if self._file is not None:
+            self._file.write(item)
+            self.ready.popleft()
+
+    def end_chunk(self) -> None:
+        """Compress the messages since the last chunk, if there are any."""
+        if not self._parts:
+            return
+        data = b"".join(self._parts)
+        indexes = {channel: index for channel, index in self._indexes.items() if index}
+        self._parts, self._size = [], 0
+        self._indexes.update({channel: [] for channel in indexes})
+        times = [time for index in indexes.values() for time in (min(index[::2]), max(index[::2]))]
+        chunk = Chunk("zstd", self._compressor.compress(data), max(times), min(times), zlib.crc32(data), len(data))
+        index = b"".join(message_index(channel, _pairs(index)) for channel, index in indexes.items())
+        self._append(PackedChunk.make(chunk, index))
 
     def flush(self) -> None:
         """End the chunk, and hand all bytes to the operating system."""
-        self._writer.flush()
+        self.end_chunk()
+        if self._file is not None:
+            self._file.flush()
 
     def finish(self) -> None:
         """Write the summary and the end of the file, and leave it open."""
-        self._writer.finish()
+        self.end_chunk()
+        if self._file is not None:
+            self._file.finish()
+
+
+def _pairs(index: list[int]) -> bytes:
+    pairs = array("Q", index)
+    if sys.byteorder == "big":
+        pairs.byteswap()
+    return pairs.tobytes()

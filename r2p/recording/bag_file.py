@@ -1,0 +1,283 @@
+"""One MCAP file that is being written: records and chunks one behind the other, then the summary.
+
+What was written in whole stays readable whatever comes after: a record that does not fit on the disk is cut off again.
+Schemas and channels stand before the chunks, not in them, so a chunk holds nothing but messages.
+"""
+
+import contextlib
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from typing import BinaryIO, Self
+
+import msgspec
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from r2p.errors import DecodeError
+from r2p.recording.format import PROFILE
+from r2p.version import __version__
+
+LIBRARY = f"r2p {__version__}"
+
+RECORD = struct.Struct("<BQ")
+"""Before each record: its opcode, and the length of what follows."""
+
+_INDEX = struct.Struct("<BQHI")  # before a channel's pairs (log time, offset), 16 bytes each
+_PAIR = 16
+_FOOTER_IN_CRC = struct.Struct("<BQQQ")
+_GROUPS = Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX
+
+
+def packed(record: McapRecord) -> bytes:
+    """Return the bytes of a record."""
+    builder = RecordBuilder()
+    record.write(builder)
+    data: bytes = builder.end()
+    return data
+
+
+class ChunkMessages(msgspec.Struct, frozen=True, gc=False):
+    """The messages of one channel in a chunk: their number, and where their index is, behind the chunk."""
+
+    count: int
+    offset: int
+
+
+class PackedChunk(msgspec.Struct, frozen=True):
+    """A chunk as it stands in a file: its record, the records of its index, and what a summary says of it."""
+
+    record: bytes
+    index: bytes
+    start: int
+    end: int
+    compression: str
+    compressed_size: int
+    uncompressed_size: int
+    channels: dict[int, ChunkMessages]
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return len(self.record) + len(self.index)
+
+    @classmethod
+    def make(cls, chunk: Chunk, index: bytes) -> Self:
+        """Make one of its record and the records of its index. Raises DecodeError if the index is damaged."""
+        return cls(
+            packed(chunk),
+            index,
+            chunk.message_start_time,
+            chunk.message_end_time,
+            chunk.compression,
+            len(chunk.data),
+            chunk.uncompressed_size,
+            dict(_channels(index)),
+        )
+
+    def summary(self, position: int) -> ChunkIndex:
+        """Return what the summary of a file says of this chunk, at this position."""
+        behind = position + len(self.record)
+        return ChunkIndex(
+            chunk_length=len(self.record),
+            chunk_start_offset=position,
+            compression=self.compression,
+            compressed_size=self.compressed_size,
+            message_end_time=self.end,
+            message_index_length=len(self.index),
+            message_index_offsets={channel: behind + part.offset for channel, part in self.channels.items()},
+            message_start_time=self.start,
+            uncompressed_size=self.uncompressed_size,
+        )
+
+
+def _channels(index: bytes) -> Iterator[tuple[int, ChunkMessages]]:
+    position = 0
+    while position < len(index):
+        try:
+            opcode, length, channel, size = _INDEX.unpack_from(index, position)
+        except struct.error:
+            raise DecodeError("the index of a chunk is cut short") from None
+        if opcode != Opcode.MESSAGE_INDEX or length != size + _INDEX.size - RECORD.size or size % _PAIR:
+            raise DecodeError("the index of a chunk is damaged")
+        yield channel, ChunkMessages(size // _PAIR, position)
+        position += _INDEX.size + size
+    if position > len(index):
+        raise DecodeError("the index of a chunk is cut short")
+
+
+def message_index(channel: int, pairs: bytes) -> bytes:
+    """Return the index of a channel's messages in a chunk: pairs of log time and offset, packed."""
+    return _INDEX.pack(Opcode.MESSAGE_INDEX, _INDEX.size - RECORD.size + len(pairs), channel, len(pairs)) + pairs
+
+
+class _Written(msgspec.Struct, frozen=True, gc=False):
+    """A record or chunk of the file: where it begins, the checksum of all before it, and its line in the summary."""
+
+    position: int
+    crc: int
+    opcode: int
+    line: bytes
+    start: int = 0
+    end: int = 0
+
+
+class BagFile:
+    """A file that is being written. `size`: its bytes so far; `summary_size`: those that `finish` adds at the most."""
+
+    def __init__(self, file: BinaryIO, *, profile: str = PROFILE) -> None:
+        """Begin the file. Raises OSError, as all of its methods do that write."""
+        self._file = file
+        self.size = 0
+        self._crc = 0
+        self._written: list[_Written] = []
+        self._schemas: dict[int, bytes] = {}
+        self._channels: dict[int, bytes] = {}
+        self._counts: Counter[int] = Counter()
+        self.summary_size = 1 << 10  # the records of a fixed size at the end have less
+        self._put(MCAP0_MAGIC + packed(Header(profile, LIBRARY)))
+
+    def write(self, item: McapRecord | PackedChunk) -> None:
+        """Write a chunk, or a record that stands outside of chunks."""
+        before, crc = self.size, self._crc
+        if isinstance(item, PackedChunk):
+            self._put(item.record + item.index)
+            self._counts.update({channel: part.count for channel, part in item.channels.items()})
+            self._enter(before, crc, packed(item.summary(before)), item)
+        else:
+            data = packed(item)
+            self._put(data)
+            self._enter(before, crc, self._line(item, data, before))
+
+    def _line(self, record: McapRecord, data: bytes, position: int) -> bytes:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = data
+        elif isinstance(record, Channel):
+            self._channels[record.id] = data
+        elif isinstance(record, Metadata):
+            return packed(MetadataIndex(position, len(data), record.name))
+        elif isinstance(record, Attachment):
+            size = len(record.data)
+            times = record.log_time, record.create_time
+            return packed(AttachmentIndex(position, len(data), *times, size, record.name, record.media_type))
+        return data
+
+    def _enter(self, position: int, crc: int, line: bytes, chunk: PackedChunk | None = None) -> None:
+        self.summary_size += len(line) + 10 * len(chunk.channels if chunk else ())
+        times = (chunk.start, chunk.end) if chunk else ()
+        self._written.append(_Written(position, crc, line[0], line, *times))
+
+    @property
+    def duration(self) -> int:
+        """Ns from the first message to the last."""
+        start, end = self._times()
+        return end - start
+
+    @property
+    def has_messages(self) -> bool:
+        """Whether there is a chunk."""
+        return bool(self._counts)
+
+    def flush(self) -> None:
+        """Hand all bytes to the operating system."""
+        self._file.flush()
+
+    def finish(self) -> None:
+        """Write the summary and the end of the file, and leave it open."""
+        end = packed(DataEnd(self._crc))
+        start = self.size + len(end)
+        builder, groups = RecordBuilder(), []
+        for opcode, lines in self._summary():
+            begin = builder.count
+            for line in lines:
+                builder.write(line)
+            if builder.count > begin:
+                groups.append(SummaryOffset(opcode, start + begin, builder.count - begin))
+        offsets = start + builder.count
+        for group in groups:
+            group.write(builder)
+        summary = builder.end()
+        crc = zlib.crc32(_FOOTER_IN_CRC.pack(Opcode.FOOTER, 20, start, offsets), zlib.crc32(summary))
+        self._put(end + summary + packed(Footer(start, offsets, crc)) + MCAP0_MAGIC)
+        self._file.flush()
+
+    def _summary(self) -> Iterator[tuple[Opcode, list[bytes]]]:
+        yield Opcode.SCHEMA, list(self._schemas.values())
+        yield Opcode.CHANNEL, list(self._channels.values())
+        yield Opcode.STATISTICS, [packed(self._statistics())]
+        for opcode in _GROUPS:
+            yield opcode, [item.line for item in self._written if item.opcode == opcode]
+
+    def _statistics(self) -> Statistics:
+        start, end = self._times()
+        records = Counter(item.opcode for item in self._written)
+        return Statistics(
+            attachment_count=records[Opcode.ATTACHMENT_INDEX],
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=records[Opcode.CHUNK_INDEX],
+            message_count=self._counts.total(),
+            message_end_time=end,
+            message_start_time=start,
+            metadata_count=records[Opcode.METADATA_INDEX],
+            schema_count=len(self._schemas),
+        )
+
+    def _times(self) -> tuple[int, int]:
+        chunks = [item for item in self._written if item.opcode == Opcode.CHUNK_INDEX]
+        return min((item.start for item in chunks), default=0), max((item.end for item in chunks), default=0)
+
+    def drop_last_chunk(self) -> dict[int, int]:
+        """Cut the last chunk off, to make room for the summary, and all that stands behind it.
+
+        Returns how many messages of each channel are lost by that; none if there was no chunk.
+        """
+        while self._written:
+            item = self._written.pop()
+            counts = self._counts_of(item.position) if item.opcode == Opcode.CHUNK_INDEX else {}
+            self.size, self._crc = item.position, item.crc
+            self._file.seek(self.size)
+            self._file.truncate()
+            if counts:
+                self._counts.subtract(counts)
+                self._counts = +self._counts
+                return counts
+        return {}
+
+    def _counts_of(self, position: int) -> dict[int, int]:
+        """Return the number of messages of each channel in the last chunk."""
+        self._file.seek(position)
+        data = self._file.read(self.size - position)
+        length = RECORD.size + RECORD.unpack_from(data)[1]
+        return {channel: part.count for channel, part in _channels(data[length:])}
+
+    def _put(self, data: bytes) -> None:
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._file.seek(self.size)
+                self._file.truncate()
+            raise
+        self._crc = zlib.crc32(data, self._crc)
+        self.size += len(data)

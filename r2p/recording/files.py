@@ -1,0 +1,347 @@
+"""The files of a recording, as the thread that writes them sees them: limits, splitting, a full disk, snapshots."""
+
+import contextlib
+import errno
+import os
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import msgspec
+
+from r2p.clock import Clock
+from r2p.errors import Error
+from r2p.log_lines import get_logger
+from r2p.recording.bag_file import BagFile, PackedChunk
+from r2p.recording.entries import Entry, EntryWriter
+from r2p.recording.writer import BagWriter
+from r2p.units import MILLISECOND, SECOND
+
+logger = get_logger("r2p.recording")
+
+_CHUNK_EVERY: Final = 500 * MILLISECOND  # ns after which messages go to the operating system, full chunk or not
+_SYNC_EVERY: Final = SECOND  # ns after which they have to be on the disk
+_FULL: Final = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EFBIG))
+_FILES_OF_TOTAL: Final = 10  # files that share max_total, where nothing else says when a file ends
+
+
+class RecordingOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How a recording is written: sizes in bytes, times in seconds; 0 is no limit.
+
+    The recording ends at `max_size` or `max_duration`; with `split`, another file begins there. `max_total` is for all
+    files: the oldest are deleted, and so they are when the disk is full. With less than `min_free` on the disk the
+    recording ends. With `snapshot`, that many seconds are kept in memory, and written when asked for. `queue_bytes` is
+    the memory for what waits for a slow disk. Raises ValueError for options that don't go together.
+    """
+
+    max_size: int = 0
+    max_duration: float = 0.0
+    split: bool = False
+    snapshot: float = 0.0
+    min_free: int = 0
+    max_total: int = 0
+    queue_bytes: int = 64 << 20
+
+    def __post_init__(self) -> None:
+        if self.max_total and not self.split:
+            raise ValueError("max_total deletes the oldest files of a recording: it needs split")
+        if self.split and not (self.max_size or self.max_duration or self.max_total):
+            raise ValueError("split needs a max_size or max_duration for each file, or a max_total for all")
+        if self.snapshot and (self.split or self.max_size or self.max_duration):
+            raise ValueError("snapshot writes a file when asked for: max_size, max_duration and split don't apply")
+
+    @property
+    def file_size(self) -> int:
+        """The bytes of one file; 0: no limit."""
+        share = self.max_total // _FILES_OF_TOTAL if not self.max_duration else 0
+        return self.max_size or share
+
+
+def open_new(path: Path) -> BinaryIO:
+    """Create a file. Raises FileExistsError, or another OSError."""
+    return path.open("xb+", buffering=0)
+
+
+class RecordingFiles:
+    """The files of a recording. All methods wait for the disk.
+
+    `entries` writes into chunks in memory, which `write` and `tick` bring to the disk. `stopped` says why there is
+    nothing more to write; `lost` counts by topic what had been accepted and is not in a file.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        options: RecordingOptions,
+        clock: Clock,
+        report: Callable[[str], None],
+        opened: Callable[[Path], BinaryIO] = open_new,
+    ) -> None:
+        """Create the first file, except for snapshots. Raises OSError, and Error if too little of the disk is free."""
+        self.path = path
+        self.paths: list[Path] = []
+        self.stopped = ""
+        self.lost: Counter[str] = Counter()
+        self.finished_bytes = 0
+        self.writer = BagWriter()
+        self.entries = EntryWriter(self.writer)
+        self._options = options
+        self._clock = clock
+        self._report = report
+        self._opened = opened
+        self._number = 0
+        self._sizes: dict[Path, int] = {}  # of finished files
+        self._ring: deque[PackedChunk] = deque()
+        self._faults = 0
+        self._chunk_due = self._sync_due = 0
+        self._began = clock.monotonic()
+        self._raw: BinaryIO | None = None
+        self._file: BagFile | None = None
+        if (free := self._free()) < options.min_free:
+            raise Error(f"only {_mb(free)} are free for {path}, and min_free is {_mb(options.min_free)}")
+        if not options.snapshot:
+            self._open()
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes in all files, those included that were deleted."""
+        return self.finished_bytes + (self._file.size if self._file else 0)
+
+    # Entries
+
+    def write(self, entries: Iterable[Entry]) -> None:
+        """Write entries into chunks, and full chunks into the file."""
+        for entry in entries:
+            try:
+                entry.write(self.entries)
+            except Exception as error:  # noqa: BLE001 - one bad entry costs no other
+                self._refuse(entry, error)
+        self._write_out()
+
+    def _refuse(self, entry: Entry, error: Exception) -> None:
+        self.lost[entry.lost_as] += entry.count
+        self._faults += 1
+        if self._faults == 1:
+            logger.exception("internal error: a message of %s is not recorded", entry.lost_as, exc_info=error)
+            self._report(f"a message of {entry.lost_as} is not recorded: {error}; others are counted")
+
+    def tick(self) -> None:
+        """End the chunk every half second, and see to it that it is on the disk every second. Call it often."""
+        now = self._clock.monotonic()
+        if now >= self._chunk_due:
+            self._chunk_due = now + _CHUNK_EVERY
+            self.writer.end_chunk()
+            self._write_out()
+        if now >= self._sync_due:
+            self._sync_due = now + _SYNC_EVERY
+            self._sync()
+        limit = self._options.max_duration
+        if limit and not self.stopped and now - self._began >= limit * SECOND:
+            self.writer.end_chunk()
+            self._write_out()
+            self._limit_reached("max_duration")
+
+    def _sync(self) -> None:
+        if self._raw is None:
+            return
+        try:
+            if not self._clock.virtual:
+                os.fdatasync(self._raw.fileno())
+            self._check_free()
+        except OSError as error:
+            self._fail(error)
+
+    def _check_free(self) -> None:
+        while self._options.min_free and self._free() < self._options.min_free:
+            if not self._delete_oldest():
+                self._stop(f"less than {_mb(self._options.min_free)} are free on the disk (min_free)")
+                return
+
+    # Out to the disk
+
+    def _write_out(self) -> None:
+        if self._options.snapshot:
+            self._keep()
+            return
+        ready = self.writer.ready
+        while ready and self._file is not None:
+            item = ready[0]
+            if isinstance(item, PackedChunk) and self._over(item):
+                self._limit_reached("max_size")
+                continue
+            try:
+                self._file.write(item)
+            except OSError as error:
+                self._fail(error)
+                continue
+            ready.popleft()
+        self._check_total()
+
+    def _over(self, chunk: PackedChunk) -> bool:
+        file, limit = self._file, self._options.file_size
+        assert file is not None
+        return bool(limit) and file.has_messages and file.size + file.summary_size + 2 * chunk.size > limit
+
+    def _limit_reached(self, limit: str) -> None:
+        if self._options.split:
+            self._next_file()
+        else:
+            self.writer.ready.clear()
+            self._stop(f"{limit} is reached")
+
+    def _next_file(self) -> None:
+        """Finish this file, and go on in another one, which begins with the channels, metadata and attachments."""
+        self._finish_file()
+        try:
+            self._open()
+        except OSError as error:
+            self._fail(error)
+
+    def _open(self) -> None:
+        while True:
+            path = self._next_path()
+            try:
+                raw = self._opened(path)
+                break
+            except FileExistsError:
+                if not self._numbered or not self._number > 1:
+                    raise
+        _sync_directory(path.parent)
+        self.paths.append(path)
+        self._began = self._clock.monotonic()
+        self._raw, self._file = raw, BagFile(raw)
+        waiting = [item for item in self.writer.ready if isinstance(item, PackedChunk)]
+        self.writer.ready.clear()
+        self.writer.ready.extend((*self.writer.registered, *waiting))
+
+    @property
+    def _numbered(self) -> bool:
+        return self._options.split or bool(self._options.snapshot)
+
+    def _next_path(self) -> Path:
+        self._number += 1
+        return self.path.with_stem(f"{self.path.stem}-{self._number:04}") if self._numbered else self.path
+
+    def _finish_file(self) -> None:
+        """Write the summary; if there is no room for it, in place of the last chunks."""
+        raw, file = self._raw, self._file
+        self._raw = self._file = None
+        if raw is None or file is None:
+            return
+        try:
+            self._finish_with_room(file)
+            if not self._clock.virtual:
+                os.fsync(raw.fileno())
+        except OSError as error:
+            self._report(f"{self.paths[-1]} has no end ({error.strerror}): `r2p bag recover` makes it whole")
+        finally:
+            with contextlib.suppress(OSError):
+                raw.close()
+            self.finished_bytes += file.size
+            self._sizes[self.paths[-1]] = file.size
+
+    def _finish_with_room(self, file: BagFile) -> None:
+        while True:
+            try:
+                file.finish()
+                return
+            except OSError as error:
+                if error.errno not in _FULL or not file.has_messages:
+                    raise
+            self._count_lost(file.drop_last_chunk())
+
+    # What goes wrong
+
+    def _fail(self, error: OSError) -> None:
+        """Make room on a full disk, or end the recording."""
+        if error.errno in _FULL and self._delete_oldest():
+            return
+        full = "the disk is full" if error.errno in _FULL else f"the disk failed: {error.strerror}"
+        self._stop(full)
+
+    def _delete_oldest(self) -> bool:
+        if not self._options.max_total or len(self.paths) < 2:
+            return False
+        path = self.paths.pop(0)
+        self._sizes.pop(path, None)
+        with contextlib.suppress(FileNotFoundError):
+            path.unlink()
+        return True
+
+    def _check_total(self) -> None:
+        limit = self._options.max_total
+        while limit and self._file and sum(self._sizes.values()) + self._file.size > limit and self._delete_oldest():
+            pass
+
+    def _stop(self, why: str) -> None:
+        """End the recording with a file that can be read."""
+        self.stopped = why
+        before = self.lost.total()
+        self.writer.end_chunk()
+        for item in self.writer.ready:
+            if isinstance(item, PackedChunk):
+                self._count_lost({channel: part.count for channel, part in item.channels.items()})
+        self.writer.ready.clear()
+        self._finish_file()
+        lost = self.lost.total() - before
+        self._report(f"recording ended: {why}" + (f"; the last {lost} messages are lost" if lost else ""))
+
+    def _count_lost(self, counts: Mapping[int, int]) -> None:
+        for channel, count in counts.items():
+            about = self.writer.channels[channel]
+            self.lost[about.metadata.get("topic", about.topic)] += count
+
+    def _free(self) -> int:
+        found = os.statvfs(self.path.parent)
+        return found.f_bavail * found.f_frsize
+
+    # Snapshots
+
+    def _keep(self) -> None:
+        """Keep the chunks of the last seconds in memory."""
+        self._ring.extend(item for item in self.writer.ready if isinstance(item, PackedChunk))
+        self.writer.ready.clear()
+        if self._ring:
+            oldest = self._ring[-1].end - round(self._options.snapshot * SECOND)
+            while self._ring[0].end < oldest:
+                self._ring.popleft()
+
+    def snapshot(self) -> Path:
+        """Write what is in memory into a new file. Raises OSError; then there is no file."""
+        self.writer.end_chunk()
+        self._keep()
+        self._open()
+        self.writer.ready.clear()
+        file = self._file
+        assert file is not None
+        try:
+            for record in self.writer.registered:
+                file.write(record)
+            for chunk in self._ring:
+                file.write(chunk)
+        except OSError:
+            self._finish_file()
+            raise
+        self._finish_file()
+        return self.paths[-1]
+
+    def finish(self) -> None:
+        """Write what is left, and end the file."""
+        self.writer.end_chunk()
+        self._write_out()
+        self._finish_file()
+
+
+def _sync_directory(path: Path) -> None:
+    """Let the name of a new file survive a loss of power."""
+    with contextlib.suppress(OSError):
+        directory = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+
+
+def _mb(count: int) -> str:
+    return f"{count / 1e6:.0f} MB"
