@@ -5,8 +5,8 @@ An entry knows how it is written, so that whoever records something new only nee
 
 import itertools
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
@@ -18,10 +18,12 @@ from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import cdr
 from r2p.runtime.sample import Sample
 
+P = TypeVar("P")
+
 _OVERHEAD = 256  # bytes of the objects around the payload of an entry, about
 
 
-class Entry(msgspec.Struct, gc=False):
+class BagEntry(msgspec.Struct, gc=False):
     """Something to write. Not changed after it was handed over."""
 
     urgent: ClassVar[bool] = False
@@ -47,7 +49,10 @@ class Entry(msgspec.Struct, gc=False):
         """Write the entry, in the thread."""
 
 
-class SampleEntry(Entry, gc=False):
+Entry = BagEntry
+
+
+class SampleEntry(BagEntry, gc=False):
     """A sample of a topic, of the given class if it is known, received at `log_time` (ns, UTC)."""
 
     topic: str
@@ -67,7 +72,7 @@ class SampleEntry(Entry, gc=False):
         out.samples.write(self.topic, self.sample, self.cls, self.log_time)
 
 
-class MessageEntry(Entry, gc=False):
+class MessageEntry(BagEntry, gc=False):
     """A message of a channel of the recorder's own, such as /r2p/events. `publish_time` 0: the same as `log_time`.
 
     Each metadata has a channel of its own.
@@ -93,7 +98,7 @@ class MessageEntry(Entry, gc=False):
         out.writer.add(channel.id, self.log_time, self.publish_time or self.log_time, sequence, data)
 
 
-class AttachmentEntry(Entry, gc=False):
+class AttachmentEntry(BagEntry, gc=False):
     """A file to attach, such as r2p.toml, as it was at `time` (ns, UTC)."""
 
     urgent: ClassVar[bool] = True
@@ -115,7 +120,7 @@ class AttachmentEntry(Entry, gc=False):
         out.writer.attach(self.name, self.media_type, self.data, self.time)
 
 
-class MetadataEntry(Entry, gc=False):
+class MetadataEntry(BagEntry, gc=False):
     """A metadata record."""
 
     urgent: ClassVar[bool] = True
@@ -145,10 +150,18 @@ class EntryWriter:
         self.writer = writer
         self.samples = SampleWriter(writer)
         self._channels: dict[Any, OwnChannel] = {}
+        self._parts: dict[Any, Any] = {}
 
-    def write(self, entry: Entry) -> None:
+    def write(self, entry: BagEntry) -> None:
         """Write an entry. Raises OSError if the bag has a file; MessageError for an entry that can't be written."""
         entry.write(self)
+
+    def part(self, kind: Callable[[BagWriter], P]) -> P:
+        """Return the writer of this kind for this bag, which is made when it is first asked for."""
+        if kind not in self._parts:
+            self._parts[kind] = kind(self.writer)
+        part: P = self._parts[kind]
+        return part
 
     def channel(self, name: str, cls: type[Message], metadata: Mapping[str, str]) -> OwnChannel:
         """Return the channel of this name, class and metadata; begin it if it is new."""
