@@ -13,8 +13,8 @@ import msgspec
 from r2p.clock import Clock
 from r2p.errors import Error
 from r2p.log_lines import get_logger
-from r2p.recording.bag_file import BagFile, PackedChunk
 from r2p.recording.entries import Entry, EntryWriter
+from r2p.recording.mcap_file import McapFile, PackedChunk
 from r2p.recording.writer import BagWriter
 from r2p.units import MILLISECOND, SECOND
 
@@ -97,7 +97,7 @@ class RecordingFiles:
         self._chunk_due = self._sync_due = 0
         self._began = clock.monotonic()
         self._raw: BinaryIO | None = None
-        self._file: BagFile | None = None
+        self._file: McapFile | None = None
         if (free := self._free()) < options.min_free:
             raise Error(f"only {_mb(free)} are free for {path}, and min_free is {_mb(options.min_free)}")
         if not options.snapshot:
@@ -210,7 +210,7 @@ class RecordingFiles:
         _sync_directory(path.parent)
         self.paths.append(path)
         self._began = self._clock.monotonic()
-        self._raw, self._file = raw, BagFile(raw)
+        self._raw, self._file = raw, McapFile(raw)
         waiting = [item for item in self.writer.ready if isinstance(item, PackedChunk)]
         self.writer.ready.clear()
         self.writer.ready.extend((*self.writer.registered, *waiting))
@@ -241,7 +241,7 @@ class RecordingFiles:
             self.finished_bytes += file.size
             self._sizes[self.paths[-1]] = file.size
 
-    def _finish_with_room(self, file: BagFile) -> None:
+    def _finish_with_room(self, file: McapFile) -> None:
         while True:
             try:
                 file.finish()

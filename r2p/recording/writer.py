@@ -17,8 +17,8 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 
 from r2p.errors import DecodeError, MessageError
-from r2p.recording.bag_file import RECORD, BagFile, PackedChunk, message_index
 from r2p.recording.format import FORMAT, METADATA, PROFILE
+from r2p.recording.mcap_file import RECORD, McapFile, PackedChunk, message_index
 from r2p.version import __version__
 
 CHUNK_SIZE = 256 << 10
@@ -58,7 +58,7 @@ class BagWriter:
         self._parts: list[bytes] = []
         self._indexes: dict[int, list[int]] = {}
         self._size = 0
-        self._file = BagFile(file, profile=profile) if file is not None else None
+        self._file = McapFile(file, profile=profile) if file is not None else None
         if about:
             self.add_metadata(METADATA, about)
 
