@@ -13,8 +13,12 @@ Nodes are coroutine functions that exchange typed messages on topics; modules ru
 import r2p.startup as _startup  # noqa: F401 - first: Ctrl-C may come during what follows
 
 # isort: split
+import importlib
+from typing import TYPE_CHECKING
+
 from r2p.bridge import BridgeOptions, ClassOf, GatewayStatistics, PortStatistics, RouteStatistics
 from r2p.errors import (
+    BagError,
     Broken,
     Closed,
     Deadlock,
@@ -86,8 +90,13 @@ from r2p.services.definition import Service
 from r2p.services.server import ServiceServer
 from r2p.version import __version__ as __version__
 
+if TYPE_CHECKING:
+    from r2p.recording.bag import Bag
+
 __all__ = [
     "Array",
+    "Bag",
+    "BagError",
     "BridgeOptions",
     "Broken",
     "ClassOf",
@@ -183,3 +192,20 @@ __all__ = [
     "u32",
     "u64",
 ]
+
+_OF_RECORDINGS = {"Bag": "r2p.recording.bag"}
+"""What is imported when it is used first: most programs record nothing, and need no extra for it."""
+
+
+def __getattr__(name: str) -> object:
+    """Return what a program uses of recordings. Raises BagError if the extra is not installed."""
+    if name not in _OF_RECORDINGS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        found: object = getattr(importlib.import_module(_OF_RECORDINGS[name]), name)
+    except ModuleNotFoundError as error:
+        if error.name != "mcap":
+            raise
+        raise BagError("recordings need mcap: pip install 'r2p[bag]'") from error
+    globals()[name] = found
+    return found

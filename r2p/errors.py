@@ -14,6 +14,7 @@
     ├── ServiceBusy                  a server with as many requests as it accepts
     ├── NoServer                     a service that no module on the network serves
     ├── ParameterError(ValueError)   a value that a parameter can't have, or a parameter that does not exist
+    ├── BagError                     a recording that can't be read or written
     ├── NodeCrashed(ExceptionGroup)  the exceptions of a module's nodes
     └── Deadlock                     virtual time with nothing left to wait for
 
@@ -89,6 +90,13 @@ class NoServer(Error):
 class ParameterError(Error, ValueError):
     """A value that a parameter refuses, a parameter that does not exist or is declared wrongly, or a file of parameters
     that can't be read or written. Nothing has changed then.
+    """
+
+
+class BagError(Error):
+    """A recording that can't be read or written: the file is missing, damaged or of a newer version, or lacks a topic.
+
+    A file that is cut is no error: it is read as far as it goes.
     """
 
 

@@ -1,0 +1,121 @@
+"""The channels of a bag, and the types of the messages on them."""
+
+import functools
+from collections.abc import Mapping
+from typing import Literal, TypeAlias, TypeVar
+
+import msgspec
+from mcap.records import Channel, Schema
+
+from r2p.errors import DecodeError, MessageError
+from r2p.messages import Message, layout
+from r2p.recording.format import CDR, META_PREFIX, OWN_PREFIX, PACKED, ROS2MSG, ChannelInfo
+from r2p.recording.summary import Summary
+
+M = TypeVar("M", bound=Message)
+
+Kind: TypeAlias = Literal["samples", "meta", "messages"]
+"""What is on a channel: samples of a topic, their companions, or other messages."""
+
+
+class BagChannel(msgspec.Struct, eq=False, dict=True):
+    """A channel of a bag: its name (`/odometry`), the encoding of its messages, their schema, and how many they are.
+
+    `info` says where samples come from; it is None on channels of other messages. For channels of other programs it is
+    made up as far as possible: they have a topic and a type, but no publisher.
+    """
+
+    name: str
+    encoding: str
+    metadata: Mapping[str, str]
+    count: int
+    kind: Kind
+    info: ChannelInfo | None = None
+    schema_name: str = ""
+    schema_encoding: str = ""
+    schema: bytes = b""
+
+    @functools.cached_property
+    def cls(self) -> type[Message] | None:
+        """The class of the messages; None if their type is unknown, or r2p can't have it (`problem`)."""
+        return self._found[0]
+
+    @property
+    def problem(self) -> str:
+        """Why the type of the messages is unknown; empty if it is known."""
+        return self._found[1]
+
+    @functools.cached_property
+    def _found(self) -> tuple[type[Message] | None, str]:
+        try:
+            return self._class(), ""
+        except MessageError as error:
+            return None, str(error)
+
+    def _class(self) -> type[Message]:
+        """Return the class of the messages. Raises MessageError."""
+        if self.info is not None and self.info.schema:
+            from r2p.recording.types import class_of
+
+            found = class_of(self.info)
+            if found is not None:
+                return found
+        if self.schema_encoding != ROS2MSG:
+            raise MessageError(f"the type of {self.name} is not in the file")
+        from r2p.ros.topics import ros_class  # only here, as it takes a tenth of a second
+
+        return ros_class(self.schema_name, 2, self.schema.decode(errors="replace"))
+
+    @property
+    def type_name(self) -> str:
+        """The full name of the type, as r2p has it; empty if it is unknown."""
+        if self.info is not None and self.info.type:
+            return self.info.type
+        return self.schema_name.replace("/msg/", "/")
+
+    def plus(self, count: int) -> "BagChannel":
+        """Return the channel with more messages, of another file."""
+        return msgspec.structs.replace(self, count=self.count + count)
+
+    def check(self, cls: type[Message]) -> str:
+        """Return why messages of this channel can't be read as this class; empty if they can."""
+        own = self.cls
+        if own is None or layout(own).fingerprint == layout(cls).fingerprint:
+            return ""
+        return f"{self.name} was recorded as {layout(own).name}, whose fields are not those of {layout(cls).name}"
+
+
+def channels_of(summary: Summary, *, is_own: bool) -> dict[int, BagChannel]:
+    """Return the channels of a file by id. In a file of r2p (`is_own`), other channels than its own have no samples."""
+    return {number: _channel(each, summary, is_own=is_own) for number, each in summary.channels.items()}
+
+
+def _channel(record: Channel, summary: Summary, *, is_own: bool) -> BagChannel:
+    schema = summary.schemas.get(record.schema_id) or Schema(0, b"", "", "")
+    info, kind = _info(record, schema, is_own=is_own)
+    return BagChannel(
+        record.topic,
+        record.message_encoding,
+        record.metadata,
+        summary.counts[record.id],
+        kind,
+        info,
+        schema.name,
+        schema.encoding,
+        schema.data,
+    )
+
+
+def _info(record: Channel, schema: Schema, *, is_own: bool) -> tuple[ChannelInfo | None, Kind]:
+    """Return where the messages of a channel come from, and what they are."""
+    if record.message_encoding not in {CDR, PACKED}:
+        return None, "messages"
+    try:
+        info = ChannelInfo.from_metadata(record.metadata)
+    except DecodeError:  # of another program
+        info = None
+    if info is not None:
+        return info, "meta" if record.topic.startswith(META_PREFIX) else "samples"
+    if is_own or record.topic.startswith(OWN_PREFIX) or schema.encoding != ROS2MSG:
+        return None, "messages"
+    return ChannelInfo(record.topic.strip("/"), numbered=False, type=schema.name.replace("/msg/", "/")), "samples"
