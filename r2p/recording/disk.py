@@ -153,7 +153,8 @@ class Disk:
     def _write(self, entries: list[Entry]) -> None:
         try:
             if self.stopped:
-                self._files.lost.update(entry.lost_as for entry in entries)
+                for entry in entries:
+                    self._files.lost[entry.lost_as] += entry.count
                 return
             self._files.write(entries)
             self._files.tick()

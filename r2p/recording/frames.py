@@ -23,6 +23,7 @@ from r2p.codecs.can_bits import ERROR, EXTENDED, FRAME_MAX, IDENTIFIER_MASK, LOC
 from r2p.errors import DecodeError
 from r2p.messages import Len, Max, Message, i64, u8, u32, u64
 from r2p.msg import Header
+from r2p.recording.entries import BagEntry, EntryWriter
 from r2p.recording.format import CDR, ROS2MSG, SEQUENCE_MASK
 from r2p.recording.types import schema_of
 from r2p.recording.writer import BagWriter
@@ -31,6 +32,7 @@ from r2p.units import SECOND
 
 FRAME_TYPE = "can_msgs/msg/Frame"
 
+_FRAME_MEMORY = 200  # bytes of a WireFrame, about
 _SENDERS_MAX = 64
 _NAME_MAX = 64
 _TEXT_MAX = 256
@@ -129,12 +131,27 @@ def bus_name(address: str) -> str:
     return _NOT_IN_NAMES.sub("_", address).strip("_") or "can"
 
 
-class FrameEntry(msgspec.Struct, frozen=True):
+class FrameEntry(BagEntry, gc=False):
     """Frames of one bus to be written. `utc_offset`: ns from their stamps, which are monotonic, to UTC."""
 
     bus: BusInfo
     frames: list[WireFrame]
     utc_offset: int = 0
+
+    @property
+    def nbytes(self) -> int:
+        return _FRAME_MEMORY * (1 + len(self.frames))
+
+    @property
+    def lost_as(self) -> str:
+        return self.bus.topic
+
+    @property
+    def count(self) -> int:
+        return len(self.frames)
+
+    def write(self, out: EntryWriter) -> None:
+        out.part(FrameWriter).write(self)
 
 
 class FrameWriter:

@@ -231,9 +231,18 @@ class SimTransport(Transport):
         self._shared = shared
         self._bus = bus
 
+    @property
+    def options(self) -> RtcanOptions:
+        """The options of the URL."""
+        return self._options
+
+    def can_bus(self) -> SimCan:
+        """Return the bus, which is made if the running loop has none of that name."""
+        return self._shared or can_bus(self._name, bitrate=self._options.bitrate, **self._bus)
+
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         options = self._options
-        shared = self._shared or can_bus(self._name, bitrate=options.bitrate, **self._bus)
+        shared = self.can_bus()
         if shared.bus.bit * options.bitrate != SECOND:
             raise TransportError(f"sim:{self._name} has {SECOND // shared.bus.bit} bit/s, not {options.bitrate}")
         node = CanNode(hub.space.module, **{"one_shot": True} | self._node)

@@ -18,10 +18,20 @@ Read `records` first (settings, and what is recorded), then `bus` (arbitration, 
 
 from r2p.sim.can.bus import CanBus
 from r2p.sim.can.controller import CanController
-from r2p.sim.can.records import CanNode, ControllerState, Count, ErrorKind, FrameRecord, Latency, Statistics
+from r2p.sim.can.records import (
+    ArbitrationLoss,
+    CanNode,
+    ControllerState,
+    Count,
+    ErrorKind,
+    FrameRecord,
+    Latency,
+    Statistics,
+)
 from r2p.sim.can.timeline import LocalAlarm, LocalClock, Timeline, TimelineTimer
 
 __all__ = [
+    "ArbitrationLoss",
     "CanBus",
     "CanController",
     "CanNode",

@@ -14,7 +14,7 @@ import msgspec
 
 from r2p.codecs.can_bits import INTERMISSION, TAIL, bits_until_lost, frame_bits, wire_bits
 from r2p.sim.can.controller import RECESSIVE_BITS, BusWire, CanController
-from r2p.sim.can.records import CanNode, ControllerState, ErrorKind, FrameRecord, Statistics
+from r2p.sim.can.records import ArbitrationLoss, CanNode, ControllerState, ErrorKind, FrameRecord, Statistics
 from r2p.sim.can.timeline import Timeline
 from r2p.units import NEVER, SECOND
 
@@ -56,7 +56,8 @@ class CanBus(BusWire):
     """A CAN 2.0B bus with extended identifiers.
 
     `timeline` is true time. `statistics` counts from the start. `observers` are called with a `FrameRecord` at the end
-    of each frame and of each attempt that failed.
+    of each frame and of each attempt that failed, `loss_observers` with an `ArbitrationLoss` at the start of the frame
+    that has won.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class CanBus(BusWire):
         self.noise = noise
         self.statistics = Statistics(bit, self.timeline.now())
         self.observers: list[Callable[[FrameRecord], object]] = []
+        self.loss_observers: list[Callable[[ArbitrationLoss], object]] = []
         self._seed = seed
         self._numbers = random.Random(f"{seed}")
         self._names: set[str] = set()
@@ -212,6 +214,8 @@ class CanBus(BusWire):
             if request.frame.id != lowest:
                 at = start + bits_until_lost(lowest, request.frame.id) * self.bit
                 self.statistics.add_lost(request.owner.name, request.frame.id)
+                for observer in self.loss_observers:
+                    observer(ArbitrationLoss(start, at, request.frame, request.owner.name))
                 request.owner.lose_arbitration(request, at)
         return [request for request in contestants if request.frame.id == lowest]
 

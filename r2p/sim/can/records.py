@@ -94,6 +94,15 @@ class FrameRecord(msgspec.Struct, frozen=True, gc=False):
     error: ErrorKind | None
 
 
+class ArbitrationLoss(msgspec.Struct, frozen=True, gc=False):
+    """An arbitration that a node lost: its frame, the start of frame, and when the node gave up (true time, ns)."""
+
+    start: int
+    end: int
+    frame: Frame
+    node: str
+
+
 class Count(msgspec.Struct, eq=False):
     """Frames that were sent, with their bits (stuff bits included, intermission not), and what was not sent."""
 

@@ -18,7 +18,7 @@ from typing import Generic, Protocol, TypeVar
 import msgspec
 
 from r2p.clock import ExactAlarm, clock_of
-from r2p.codecs.can_bits import Frame, OtherFrame
+from r2p.codecs.can_bits import Frame, OtherFrame, WireFrame
 from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.stats import RETRY_AFTER_ERROR
 from r2p.units import NEVER
@@ -56,6 +56,16 @@ class CanPortListener(Protocol):
 
     def internal_error(self, error: Exception) -> None:
         """Count and log an exception in the handling of a frame or a timer. The port goes on with the next one."""
+
+
+class FrameTap(Protocol):
+    """An observer of a real interface, which gets every frame as it was on the bus. None of its calls raises."""
+
+    def on_frames(self, frames: list[WireFrame], utc_offset: int) -> None:
+        """Handle a batch, own and error frames included. `utc_offset`: ns from their stamps to UTC."""
+
+    def on_lost(self, count: int, reason: str) -> None:
+        """Count frames that were on the bus and can't be handed out."""
 
 
 class PortAlarm(Protocol):
@@ -185,6 +195,8 @@ class InterfacePort(CanPort, Generic[B]):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
+        self.tap: FrameTap | None = None
+        """Gets all frames in place of the listener, which then only hears of the interface; set before `run`."""
         self._filters: list[tuple[int, int]] | None = [(0, 0)]
         self._bus: B | None = None
 

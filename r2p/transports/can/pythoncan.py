@@ -18,10 +18,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from r2p.clock import Backoff, random_of
-from r2p.codecs.can_bits import Frame, OtherFrame
+from r2p.codecs.can_bits import ERROR, EXTENDED, FRAME_MAX, IDENTIFIER_MASK, LOCAL, REMOTE, Frame, OtherFrame, WireFrame
 from r2p.errors import TransportError
 from r2p.protocols.can_orders import Mailbox, Outcome
-from r2p.transports.can.port import CanPortListener, InterfacePort, OpenInterface
+from r2p.transports.can.port import CanPortListener, FrameTap, InterfacePort, OpenInterface
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
@@ -74,7 +74,8 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
 
     async def _serve(self, listener: CanPortListener, opened: Callable[[], object]) -> bool:
         """Use the interface until it fails. Return False if it can't be opened now."""
-        bus = _PythonCanBus(self._can, listener, echo=self._interface in ECHO_ON_REQUEST | ECHO_ALWAYS)
+        echo = self._interface in ECHO_ON_REQUEST | ECHO_ALWAYS
+        bus = _PythonCanBus(self._can, listener, echo=echo, tap=self.tap)
         try:
             problem = await self._open(bus)
             opened()
@@ -117,10 +118,11 @@ others may pass, such as those of an adapter that is not plugged in.
 class _PythonCanBus(OpenInterface):
     """An open interface. All methods run in the event loop but the last ones, which run in other threads."""
 
-    def __init__(self, library: Any, listener: CanPortListener, *, echo: bool) -> None:
+    def __init__(self, library: Any, listener: CanPortListener, *, echo: bool, tap: FrameTap | None = None) -> None:
         super().__init__(listener, latency=_LATENCY, confirm_timeout=CONFIRM_TIMEOUT_NS)
         self._can = library
         self._echo = echo
+        self._tap = tap
         self._thread = concurrent.futures.ThreadPoolExecutor(1, "python-can")
         self._bus: can.BusABC | None = None
         self._notifier: can.Notifier | None = None
@@ -146,6 +148,8 @@ class _PythonCanBus(OpenInterface):
             pass  # the adapter is gone: there is nothing to close
         finally:
             self._thread.shutdown(wait=False)
+        while self._tap is not None and self._queue:
+            self._hand_to_tap(self._tap)
 
     def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
         assert self._bus is not None
@@ -178,6 +182,32 @@ class _PythonCanBus(OpenInterface):
     def _handle_batch(self) -> None:
         """Handle frames that the Notifier's thread has read."""
         self._scheduled = False  # first: a frame that is read from here on schedules the next batch
+        if self._tap is not None:
+            self._hand_to_tap(self._tap)
+        else:
+            self._hand_out()
+        if self._queue:
+            self._schedule_batch()
+        self._arm()
+
+    def _hand_to_tap(self, tap: FrameTap) -> None:
+        offset = time.time_ns() - self._clock.monotonic()
+        frames: list[WireFrame] = []
+        for _ in range(min(len(self._queue), _BATCH)):
+            message, read_at = self._queue.popleft()
+            if message.is_fd:
+                tap.on_lost(1, "CAN FD")
+            else:
+                frames.append(wire_frame(message, _stamp(message, read_at + offset) - offset))
+        try:
+            tap.on_frames(frames, offset)
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next batch follows
+            self._listener.internal_error(error)
+        if self._reported < self._dropped:
+            lost, self._reported = self._dropped - self._reported, self._dropped
+            tap.on_lost(lost, "receive queue full")
+
+    def _hand_out(self) -> None:
         now, utc = self._clock.monotonic(), time.time()
         for _ in range(min(len(self._queue), _BATCH)):
             message, read_at = self._queue.popleft()
@@ -189,9 +219,6 @@ class _PythonCanBus(OpenInterface):
         while self._reported < self._dropped:
             self._reported += 1
             self._listener.on_fault("receive queue full")
-        if self._queue:
-            self._schedule_batch()
-        self._arm()
 
     def _receive(self, message: "can.Message", stamp: int) -> None:
         if message.is_error_frame:
@@ -248,6 +275,21 @@ class _PythonCanBus(OpenInterface):
     def _schedule_batch(self) -> None:
         self._scheduled = True
         self._loop.call_soon_threadsafe(self._handle_batch)
+
+
+def wire_frame(message: "can.Message", stamp: int) -> WireFrame:
+    """Return a message of python-can as a frame; not one of CAN FD."""
+    flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame
+    data = bytes(message.dlc) if message.is_remote_frame else bytes(message.data[:FRAME_MAX])
+    if message.is_error_frame:
+        flags, data = ERROR, data.ljust(FRAME_MAX, b"\0")
+    return message.arbitration_id & IDENTIFIER_MASK | flags, data, 0 if message.is_rx else LOCAL, stamp
+
+
+def _stamp(message: "can.Message", read_at: int) -> int:
+    """Return the driver's stamp, or that of reading if it is by another clock (ns, UTC)."""
+    stamp = round(message.timestamp * SECOND)
+    return stamp if 0 <= read_at - stamp < _STAMP_AGE_MAX_S * SECOND else read_at
 
 
 def _library() -> Any:

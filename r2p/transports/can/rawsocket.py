@@ -7,6 +7,7 @@ Error frames report what a driver knows of the bus and of the controller (linux/
 everything: many never report that arbitration was lost, or only with `berr-reporting on`.
 """
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -18,7 +19,7 @@ from typing import Any
 
 import msgspec
 
-from r2p.codecs.can_bits import Frame
+from r2p.codecs.can_bits import Frame, WireFrame
 from r2p.units import SECOND
 
 BATCH = 64
@@ -33,14 +34,13 @@ DATA = socket.CAN_EFF_FLAG
 FLAGS = ERROR | DATA | socket.CAN_RTR_FLAG
 """All flags in an identifier."""
 
-ReceivedFrame = tuple[int, bytes, int, int]
-"""Identifier with FLAGS, up to 8 bytes, flags of the message such as OWN, and stamp (ns of the monotonic clock)."""
-
 _OLDEST = 10 * SECOND  # ns; a stamp that seems older was made before the computer's clock was set
 _RECEIVE_BUFFER = 1 << 19  # bytes: some hundred frames, tens of ms of a saturated bus
 _KIND = DATA | socket.CAN_RTR_FLAG  # flags that filters look at, too; with ERROR they would be for error frames
 _FILTERS_MAX = 512  # CAN_RAW_FILTER_MAX
 _CAN_RAW_ERR_FILTER, _SO_RXQ_OVFL, _SO_TIMESTAMPNS = 2, 40, 64  # the last one has 64-bit seconds on all machines
+_SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55
+_MEMINFO = struct.Struct("=9I")  # SK_MEMINFO_*, of which the last one are drops
 _QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
 
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame
@@ -79,13 +79,16 @@ class _MMsgHdr(ctypes.Structure):
 class RawSocket:
     """A CAN_RAW socket on one interface. Raises OSError as Python's sockets do."""
 
-    def __init__(self, name: str) -> None:
-        """Open the socket. It receives nothing until `set_filters`."""
+    def __init__(self, name: str, receive_buffer: int = _RECEIVE_BUFFER) -> None:
+        """Open the socket. It receives nothing until `set_filters`.
+
+        `receive_buffer`: bytes of its queue; without CAP_NET_ADMIN the kernel gives net.core.rmem_max at most.
+        """
         self.dropped = 0
         """Frames that the kernel dropped because this socket's queue was full."""
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
         try:
-            self._configure()
+            self._configure(receive_buffer)
             self._socket.bind((name,))
         except BaseException:  # the caller has no socket yet that it could close
             self._socket.close()
@@ -125,13 +128,26 @@ class RawSocket:
             raise
         return True
 
-    def receive(self) -> list[ReceivedFrame]:
-        """Read the waiting frames, at most BATCH."""
+    @property
+    def utc_offset(self) -> int:
+        """Ns from the stamps of the last batch to UTC."""
+        return self._batch.utc_offset
+
+    def receive(self) -> list[WireFrame]:
+        """Read the waiting frames, at most BATCH. Their stamps are ns of the monotonic clock."""
         frames, self.dropped = self._batch.receive(self.dropped)
         return frames
 
-    def _configure(self) -> None:
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+    def count_dropped(self) -> int:
+        """Return how many frames were dropped so far; `dropped` is of when the last frame came."""
+        values = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+        return int(_MEMINFO.unpack(values)[-1]) if len(values) == _MEMINFO.size else self.dropped
+
+    def _configure(self, receive_buffer: int) -> None:
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
+        if receive_buffer > _RECEIVE_BUFFER:
+            with contextlib.suppress(OSError):  # not privileged
+                self._socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, receive_buffer)
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # receive nothing yet
@@ -144,6 +160,7 @@ class _Batch:
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
+        self.utc_offset = 0
         self._recvmmsg: Any = ctypes.CDLL(None, use_errno=True).recvmmsg
         self._frames = ctypes.create_string_buffer(BATCH * _FRAME.size)
         self._controls = ctypes.create_string_buffer(BATCH * _CONTROL.size)
@@ -160,7 +177,7 @@ class _Batch:
         numbers = memoryview(self._messages).cast("B").cast("I")
         self._flags = numbers[_MsgHdr.flags.offset // 4 :: ctypes.sizeof(_MMsgHdr) // 4]
 
-    def receive(self, dropped: int) -> tuple[list[ReceivedFrame], int]:
+    def receive(self, dropped: int) -> tuple[list[WireFrame], int]:
         """Read a batch. Return its frames, and how many were dropped since the socket was opened."""
         count = self._recvmmsg(self._fd, self._messages, BATCH, socket.MSG_DONTWAIT, None)
         if count < 0:
@@ -169,8 +186,8 @@ class _Batch:
                 return [], dropped
             raise OSError(code, os.strerror(code))
         now = time.monotonic_ns()  # the kernel stamps in UTC, r2p in monotonic time
-        offset = time.time_ns() - now
-        received: list[ReceivedFrame] = []
+        self.utc_offset = offset = time.time_ns() - now
+        received: list[WireFrame] = []
         frames = _FRAME.iter_unpack(self._frame_bytes[: count * _FRAME.size])
         controls = _CONTROL.iter_unpack(self._control_bytes[: count * _CONTROL.size])
         flags = self._flags[:count].tolist()
@@ -247,6 +264,18 @@ def decode_error(identifier: int, data: bytes) -> ErrorReport:
         arbitration_lost=bool(identifier & _LOST_ARBITRATION),
         destroyed=bool(own or identifier & (_NO_ACKNOWLEDGE | _TRANSMIT_TIMEOUT)),
     )
+
+
+def encode_error(kind: str) -> tuple[int, bytes]:
+    """Return an error frame that reports one kind of error: its identifier, without the flags, and its 8 bytes."""
+    for identifier, name in _CLASSES.items():
+        if name == kind:
+            return identifier, bytes(8)
+    for place, identifier, names in ((1, _CONTROLLER, _CONTROLLERS), (2, _PROTOCOL, _PROTOCOLS)):
+        for bit, name in names.items():
+            if name == kind:
+                return identifier, bytes(bit if at == place else 0 for at in range(8))
+    raise ValueError(f"SocketCAN has no error {kind!r}")
 
 
 def _names(bits: int, names: dict[int, str]) -> list[str]:

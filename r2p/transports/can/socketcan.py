@@ -7,17 +7,18 @@ so one socket serves three classes, and its receive queue keeps the order of oth
 r2p never configures an interface: it waits until the interface can be used, and reports the command for that.
 """
 
+import contextlib
 import errno
 import os
 import socket
 from collections.abc import Callable
 
 from r2p.clock import Backoff, clock_of, random_of
-from r2p.codecs.can_bits import Frame, OtherFrame
+from r2p.codecs.can_bits import Frame, OtherFrame, WireFrame
 from r2p.errors import TransportError
 from r2p.protocols.can_orders import Mailbox, Outcome
 from r2p.transports.can import netlink, rawsocket
-from r2p.transports.can.port import CanPortListener, InterfacePort, OpenInterface, PortAlarm
+from r2p.transports.can.port import CanPortListener, FrameTap, InterfacePort, OpenInterface, PortAlarm
 from r2p.transports.can.rawsocket import RawSocket
 from r2p.units import SECOND
 
@@ -32,6 +33,8 @@ CONFIRM_TIMEOUT_ONE_SHOT_NS = 20_000_000
 
 _MASK = socket.CAN_EFF_MASK
 _BATCHES_MAX = 16  # more than the socket's receive queue holds
+_TAP_BUFFER = 8 << 20  # bytes of the queue for an observer of all frames: a second of a saturated bus
+_TAP_BATCHES_MAX = 512  # ... and more than that holds
 _CHECK_MAX_S = 2.0  # between checks of an interface that is not there; changes are noticed earlier
 
 
@@ -98,6 +101,8 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
                 return interface.problem
             # Read each time: the interface may have been configured anew while it was down.
             self.one_shot = interface.one_shot
+            if self.tap is not None:
+                return _SocketCanBus(RawSocket(self.name, _TAP_BUFFER), listener, tap=self.tap)
             return _SocketCanBus(RawSocket(self.name), listener, one_shot=interface.one_shot)
         except OSError as error:
             return f"{self.name}: {_reason(error)}"
@@ -106,7 +111,9 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
 class _SocketCanBus(OpenInterface):
     """An interface while it is up."""
 
-    def __init__(self, sock: RawSocket, listener: CanPortListener, *, one_shot: bool) -> None:
+    def __init__(
+        self, sock: RawSocket, listener: CanPortListener, *, one_shot: bool = False, tap: FrameTap | None = None
+    ) -> None:
         # A one-shot controller reports a failure by an error frame, which names no frame: so one at a time.
         super().__init__(
             listener,
@@ -119,12 +126,15 @@ class _SocketCanBus(OpenInterface):
         self._socket = sock
         self._one_shot = one_shot
         self._dropped = 0
+        self._tap = tap
 
     def start(self) -> None:
         self._loop.add_reader(self._socket.fileno(), self._read_batch)
 
     def close(self) -> None:
         self._loop.remove_reader(self._socket.fileno())
+        if self._tap is not None:
+            self._read_last(self._tap)
         self._socket.close()
         self._timer.close()
         self._mailboxes.clear()
@@ -161,13 +171,16 @@ class _SocketCanBus(OpenInterface):
             return 0
         self.read_at = self._clock.monotonic()
         try:
-            self._hand_out(frames)
+            if self._tap is None:
+                self._hand_out(frames)
+            else:
+                self._hand_to_tap(frames, self._tap)
         finally:
             self.read_at = None
         self._arm()
         return len(frames)
 
-    def _hand_out(self, frames: list[rawsocket.ReceivedFrame]) -> None:
+    def _hand_out(self, frames: list[WireFrame]) -> None:
         # Runs for every frame on the bus: names are local to save look-ups, and the most frequent kind comes first.
         received, mask, own = self._listener.on_frame, _MASK, rawsocket.OWN
         flags_of_id, data_frame = rawsocket.FLAGS, rawsocket.DATA
@@ -187,6 +200,27 @@ class _SocketCanBus(OpenInterface):
         while self._dropped < self._socket.dropped:
             self._dropped += 1
             self._listener.on_fault("receive queue full")
+
+    def _hand_to_tap(self, frames: list[WireFrame], tap: FrameTap) -> None:
+        try:
+            tap.on_frames(frames, self._socket.utc_offset)
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next batch follows
+            self._listener.internal_error(error)
+        self._report_dropped(self._socket.dropped, tap)
+
+    def _report_dropped(self, dropped: int, tap: FrameTap) -> None:
+        if dropped > self._dropped:
+            tap.on_lost(dropped - self._dropped, "receive queue full")
+            self._dropped = dropped
+
+    def _read_last(self, tap: FrameTap) -> None:
+        """Read the frames that wait, and count those that were dropped behind the last of them."""
+        with contextlib.suppress(OSError):  # the interface is gone: nothing waits
+            for _ in range(_TAP_BATCHES_MAX):
+                if not (frames := self._socket.receive()):
+                    break
+                self._hand_to_tap(frames, tap)
+        self._report_dropped(self._socket.count_dropped(), tap)
 
     def _own_frame(self, identifier: int, data: bytes, stamp: int) -> None:
         if not self._mailboxes.seen(identifier, data, stamp, self._clock.monotonic()):
