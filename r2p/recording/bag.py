@@ -254,8 +254,8 @@ class Bag:
                     metas[number, info, sequence] = cdr(SampleMeta).decode(data)
                     continue
                 meta = metas.pop((number, info, sequence), _DEFAULT) if metas else _DEFAULT
-                is_cdr = channel.encoding == CDR
-                sample = sample_of(info, sequence, publish_time, data, meta, is_cdr=is_cdr, cls=channel.cls)
+                from_cdr = channel.from_cdr if channel.encoding == CDR else None
+                sample = sample_of(info, sequence, publish_time, data, meta, from_cdr=from_cdr)
             except DecodeError as error:
                 self._count_undecodable(info.topic, channel.problem or error)
                 continue

@@ -1,7 +1,7 @@
 """The channels of a bag, and the types of the messages on them."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias, TypeVar
 
 import msgspec
@@ -11,6 +11,9 @@ from r2p.errors import DecodeError, MessageError
 from r2p.messages import Message, layout
 from r2p.recording.format import CDR, META_PREFIX, OWN_PREFIX, PACKED, ROS2MSG, ChannelInfo
 from r2p.recording.summary import Summary
+from r2p.recording.types import ChannelType, type_of
+from r2p.ros.cdr import cdr
+from r2p.ros.transcoding import transcoder
 
 M = TypeVar("M", bound=Message)
 
@@ -38,7 +41,7 @@ class BagChannel(msgspec.Struct, eq=False, dict=True):
     @functools.cached_property
     def cls(self) -> type[Message] | None:
         """The class of the messages; None if their type is unknown, or r2p can't have it (`problem`)."""
-        return self._found[0]
+        return None if self._found[0] is None else self._found[0].cls
 
     @property
     def problem(self) -> str:
@@ -46,25 +49,37 @@ class BagChannel(msgspec.Struct, eq=False, dict=True):
         return self._found[1]
 
     @functools.cached_property
-    def _found(self) -> tuple[type[Message] | None, str]:
+    def from_cdr(self) -> Callable[[bytes, bytes], bytes]:
+        """The function that makes packed messages of CDR, and of what CDR does not have. Raises DecodeError."""
+        found, problem = self._found
+        if found is None or found.cdr_cls is None:
+            raise DecodeError(problem or f"the definition of {found and layout(found.cls).name} is not in the file")
+        cls = found.cdr_cls
+        if b"wstring" not in self.schema:
+            return transcoder(cls).from_cdr
+        codec = cdr(cls)  # of another program: ours write no wide texts
+        return lambda data, _: layout(cls).encode(codec.decode(data))
+
+    @functools.cached_property
+    def _found(self) -> tuple[ChannelType | None, str]:
         try:
-            return self._class(), ""
+            return self._type(), ""
         except MessageError as error:
             return None, str(error)
 
-    def _class(self) -> type[Message]:
-        """Return the class of the messages. Raises MessageError."""
+    def _type(self) -> ChannelType:
+        """Return the type of the messages. Raises MessageError."""
+        definition = self.schema.decode(errors="replace") if self.schema_encoding == ROS2MSG else ""
         if self.info is not None and self.info.schema:
-            from r2p.recording.types import class_of
-
-            found = class_of(self.info)
+            found = type_of(self.info, definition)
             if found is not None:
                 return found
         if self.schema_encoding != ROS2MSG:
             raise MessageError(f"the type of {self.name} is not in the file")
         from r2p.ros.topics import ros_class  # only here, as it takes a tenth of a second
 
-        return ros_class(self.schema_name, 2, self.schema.decode(errors="replace"))
+        cls = ros_class(self.schema_name, 2, definition)
+        return ChannelType(cls, cls)
 
     @property
     def type_name(self) -> str:

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from r2p.messages import Max, Message, i64, u8, u64
 
-_REST_MAX = 1 << 16
+REST_MAX = 1 << 16
 
 
 class SampleMeta(Message, name="r2p_msgs/SampleMeta"):
@@ -25,4 +25,4 @@ class SampleMeta(Message, name="r2p_msgs/SampleMeta"):
     clock_offset: i64 = 0
     clock_error: i64 = -1
     number: u64 = 0
-    rest: Annotated[bytes, Max(_REST_MAX)] = b""
+    rest: Annotated[bytes, Max(REST_MAX)] = b""

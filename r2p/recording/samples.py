@@ -1,21 +1,22 @@
 """Samples as records of a bag, and records as samples."""
 
+import contextlib
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import msgspec
 
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import ClockOffset, Message, layout
 from r2p.recording.format import CDR, META_PREFIX, PACKED, ROS2MSG, SEQUENCE_MASK, ChannelInfo
-from r2p.recording.messages import SampleMeta
-from r2p.recording.types import schema_of
+from r2p.recording.messages import REST_MAX, SampleMeta
+from r2p.recording.types import Ros2Schema, schema_of, type_of
 from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import cdr
-from r2p.ros.transcoding import Transcoder, transcoder
-from r2p.runtime.sample import Sample, Source
+from r2p.ros.transcoding import transcoder
+from r2p.runtime.sample import PublisherClass, Sample, Source
 
-_DEFAULT = SampleMeta()
+_TIME_MASK = (1 << 64) - 1  # times in a file are not negative, those of a module may be
 
 
 class SampleWriter:
@@ -23,70 +24,90 @@ class SampleWriter:
 
     def __init__(self, writer: BagWriter) -> None:
         self._writer = writer
-        self._channels: dict[tuple[ChannelInfo, type[Message] | None], _WrittenChannel] = {}
-        self._companions: dict[ChannelInfo, int] = {}
+        self._channels: dict[_ChannelKey, _SampleChannel] = {}
 
     def write(self, topic: str, sample: Sample, cls: type[Message] | None, log_time: int) -> None:
-        """Write a sample that was received at `log_time` (ns, UTC). Without a class, or if it is not a message of that
-        class, it is written as packed bytes.
+        """Write a sample that was received at `log_time` (ns, UTC).
+
+        It is written as packed bytes without a class, if it is not a message of that class, and if the class is one
+        that ROS can't define. Raises MessageError if the file can't have one more channel.
         """
-        channel = self._channel(topic, sample, cls)
-        data, rest = sample.data, b""
-        if channel.transcoder is not None:
+        data, rest, number, due = sample.data, b"", sample.sequence, sample.deadline or sample.expires
+        key = (topic, sample.source, sample.publisher_class, number > 0, cls)
+        channel = self._channels.get(key) or self._add(key)
+        if channel.to_cdr is not None:
             try:
-                data, rest = channel.transcoder.to_cdr(sample.data)
+                data, rest = channel.to_cdr(data)
             except DecodeError:
-                channel, data = self._channel(topic, sample, None), sample.data
-        sequence = sample.sequence & SEQUENCE_MASK or next(channel.count)
-        publish_time = sample.stamp if sample.stamped else log_time
-        meta = _meta(sample, rest)
-        if meta is not None:
-            companion = self._companion(channel)
-            self._writer.add(companion, log_time, publish_time, sequence, cdr(SampleMeta).encode(meta))
+                channel = self._untyped(key)
+            if len(rest) > REST_MAX:
+                channel, data, rest = self._untyped(key), sample.data, b""
+        publish_time = sample.stamp & _TIME_MASK if sample.stamped else log_time
+        sequence = number & SEQUENCE_MASK if number else next(channel.count) & SEQUENCE_MASK
+        plain = sample.stamped and sample.drop_late and sample.clock is None and not (due or sample.hops or rest)
+        if not plain or number > SEQUENCE_MASK:
+            meta = cdr(SampleMeta).encode(_meta(sample, rest))
+            self._writer.add(self._companion(channel), log_time, publish_time, sequence, meta)
         self._writer.add(channel.id, log_time, publish_time, sequence, data)
 
-    def _channel(self, topic: str, sample: Sample, cls: type[Message] | None) -> "_WrittenChannel":
-        source = sample.source
-        info = ChannelInfo(
-            topic, source.module, source.node, sample.publisher_class, source.link, numbered=sample.sequence > 0
-        )
-        key = info, cls
-        if key not in self._channels:
-            self._channels[key] = self._add(info, cls)
-        return self._channels[key]
+    def _untyped(self, key: "_ChannelKey") -> "_SampleChannel":
+        key = (*key[:-1], None)
+        return self._channels.get(key) or self._add(key)
 
-    def _add(self, info: ChannelInfo, cls: type[Message] | None) -> "_WrittenChannel":
+    def _add(self, key: "_ChannelKey") -> "_SampleChannel":
+        topic, source, publisher_class, numbered, cls = key
+        info = ChannelInfo(topic, source.module, source.node, publisher_class, source.link, numbered=numbered)
+        schema = None
         if cls is not None:
-            try:
-                schema = schema_of(cls)
-            except MessageError:
-                return self._add(info, None)
-            info = msgspec.structs.replace(info, type=layout(cls).name, schema=layout(cls).schema)
-            text = schema.name, ROS2MSG, schema.text.encode()
-            channel = self._writer.add_channel(f"/{info.topic}", CDR, info.metadata, text)
-            return _WrittenChannel(channel, info, transcoder(cls))
-        return _WrittenChannel(self._writer.add_channel(f"/{info.topic}", PACKED, info.metadata), info, None)
+            info, schema = _typed(info, cls)
+        number = self._writer.add_channel(f"/{topic}", CDR if schema else PACKED, info.metadata, _mcap_schema(schema))
+        to_cdr = transcoder(cls).to_cdr if schema is not None and cls is not None else None
+        self._channels[key] = made = _SampleChannel(number, info, to_cdr)
+        return made
 
-    def _companion(self, channel: "_WrittenChannel") -> int:
-        info = channel.info
-        if info not in self._companions:
-            schema = schema_of(SampleMeta)
-            text = schema.name, ROS2MSG, schema.text.encode()
-            self._companions[info] = self._writer.add_channel(f"{META_PREFIX}{info.topic}", CDR, info.metadata, text)
-        return self._companions[info]
+    def _companion(self, channel: "_SampleChannel") -> int:
+        if not channel.companion:
+            name, schema = f"{META_PREFIX}{channel.info.topic}", _mcap_schema(schema_of(SampleMeta))
+            channel.companion = self._writer.add_channel(name, CDR, channel.info.metadata, schema)
+        return channel.companion
 
 
-class _WrittenChannel(msgspec.Struct, eq=False):
+_ChannelKey = tuple[str, Source, PublisherClass, bool, type[Message] | None]
+"""What the messages of a channel have in common: topic, source, class, whether they have numbers, and their type."""
+
+
+class _SampleChannel(msgspec.Struct, eq=False):
     id: int
     info: ChannelInfo
-    transcoder: Transcoder | None
+    to_cdr: Callable[[bytes], tuple[bytes, bytes]] | None
+    companion: int = 0
     count: Iterator[int] = msgspec.field(default_factory=lambda: itertools.count(1))
 
 
-def _meta(sample: Sample, rest: bytes) -> SampleMeta | None:
-    """Return what has to be recorded of a sample besides its bytes; None for nothing."""
+def _typed(info: ChannelInfo, cls: type[Message]) -> tuple[ChannelInfo, Ros2Schema | None]:
+    """Return what a channel says of its type, and its schema; None if its messages are written packed.
+
+    These are messages of classes that ROS can't define, and of those that can't be made again of what the file says of
+    them. If not even the layout says it, as it is too long, the type is unknown.
+    """
+    typed = msgspec.structs.replace(info, type=layout(cls).name, schema=layout(cls).schema)
+    with contextlib.suppress(MessageError):
+        schema, zero = schema_of(cls), layout(cls).zero.encode()
+        found = type_of(typed, schema.text)
+        other = None if found is None else found.cdr_cls
+        if other is not None and transcoder(other).to_cdr(zero) == transcoder(cls).to_cdr(zero):
+            return typed, schema
+    return (info if type_of(typed) is None else typed), None
+
+
+def _mcap_schema(schema: Ros2Schema | None) -> tuple[str, str, bytes] | None:
+    return (schema.name, ROS2MSG, schema.text.encode()) if schema is not None else None
+
+
+def _meta(sample: Sample, rest: bytes) -> SampleMeta:
+    """Return what has to be recorded of a sample besides its bytes."""
     clock = sample.clock or ClockOffset(0, 0, -1)
-    meta = SampleMeta(
+    return SampleMeta(
         stamped=sample.stamped,
         drop_late=sample.drop_late,
         hops=sample.hops,
@@ -98,7 +119,6 @@ def _meta(sample: Sample, rest: bytes) -> SampleMeta | None:
         number=sample.sequence if sample.sequence > SEQUENCE_MASK else 0,
         rest=rest,
     )
-    return None if meta == _DEFAULT else meta
 
 
 def sample_of(
@@ -108,17 +128,16 @@ def sample_of(
     data: bytes,
     meta: SampleMeta,
     *,
-    is_cdr: bool,
-    cls: type[Message] | None,
+    from_cdr: Callable[[bytes, bytes], bytes] | None,
 ) -> Sample:
-    """Return the sample that a record was made of; its message is not decoded. Raises DecodeError."""
-    if is_cdr and cls is None:
-        raise DecodeError(f"the type of /{info.topic} is unknown")
-    packed = transcoder(cls).from_cdr(data, meta.rest) if is_cdr and cls is not None else data
+    """Return the sample that a record was made of; its message is not decoded. Raises DecodeError.
+
+    `from_cdr` makes packed messages of its CDR (`Transcoder.from_cdr`); None where it is packed.
+    """
     return Sample(
-        packed,
+        data if from_cdr is None else from_cdr(data, meta.rest),
         Source(info.module, info.node, info.link),
-        publish_time,
+        publish_time - (publish_time >> 63 << 64),
         meta.deadline,
         meta.number or (sequence if info.numbered else 0),
         info.publisher_class,

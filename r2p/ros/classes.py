@@ -165,16 +165,19 @@ def _tuple(item: Any, bound: Len | Max) -> Any:
 def definitions_of(cls: type[Message], version: int) -> dict[str, MessageDefinition]:
     """Return the definition of a message class for ROS 1 or 2 (`version`), and then those of all messages in it.
 
-    Raises MessageError for a class that ROS can't define: one with an array of arrays.
+    Raises MessageError for a class that ROS can't define: one with an array of arrays, or with two types of one name.
     """
     found: dict[str, MessageDefinition] = {}
+    schemas: dict[str, str] = {}
 
     def visit(shape: Shape) -> None:
         match shape:
             case Nested(inner) if inner.cls not in _TIME_NAMES[version] and inner.name not in found:
-                found[inner.name] = _definition(inner, version)
+                found[inner.name], schemas[inner.name] = _definition(inner, version), inner.schema
                 for field in inner.fields:
                     visit(field.shape)
+            case Nested(inner) if schemas.get(inner.name, inner.schema) != inner.schema:
+                raise MessageError(f"{layout(cls).name} has two types in it that are named {inner.name}: rename one")
             case FixedArray(item) | VariableArray(item):
                 visit(item)
             case _:
