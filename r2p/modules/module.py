@@ -11,7 +11,7 @@ import asyncio
 import logging
 import os
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -44,7 +44,7 @@ from r2p.parameters.file import ParameterFile
 from r2p.parameters.registry import ModuleParameters
 from r2p.parameters.sources import GivenParameters, given
 from r2p.protocols.discovery.events import Command
-from r2p.runtime.events import EventHub, ModuleEvent
+from r2p.runtime.events import EventHub, EventListener
 from r2p.runtime.node import Node, no_log
 from r2p.runtime.topic import TopicSpace
 from r2p.transports.link import Link, Transport
@@ -465,10 +465,10 @@ class Module:
         for link in self.links:
             link.query()
 
-    def events(self) -> AsyncIterator[ModuleEvent]:
+    def events(self) -> EventListener:
         """Iterate over what happens to the links and on the network, from this call on, until the module closes.
 
-        The iterator holds 256 events; a slow reader loses the oldest ones.
+        The iterator holds 256 events; a slow reader loses the oldest ones, which its `lost` counts.
         """
         return self._events.listen()
 

@@ -64,19 +64,20 @@ class EventHub:
 
     def __init__(self) -> None:
         # By number, not in a WeakSet: so listeners are woken in the same order in every run under virtual time.
-        self._listeners: weakref.WeakValueDictionary[int, _Listener] = weakref.WeakValueDictionary()
+        self._listeners: weakref.WeakValueDictionary[int, EventListener] = weakref.WeakValueDictionary()
         self._numbers = itertools.count()
         self._closed = False
 
-    def listen(self) -> AsyncIterator[ModuleEvent]:
+    def listen(self) -> "EventListener":
         """Iterate over all events from this call on, until the hub is closed."""
-        listener = _Listener()
+        listener = EventListener()
         listener.closed = self._closed
         self._listeners[next(self._numbers)] = listener
         return listener
 
     def emit(self, event: ModuleEvent) -> None:
         for listener in list(self._listeners.values()):
+            listener.lost += len(listener.queue) == EVENTS
             listener.queue.append(event)
             listener.arrived.set()
 
@@ -88,8 +89,11 @@ class EventHub:
             listener.arrived.set()
 
 
-class _Listener(AsyncIterator[ModuleEvent]):
+class EventListener(AsyncIterator[ModuleEvent]):
+    """Iterates over events; `lost` counts those that it was too slow for."""
+
     def __init__(self) -> None:
+        self.lost = 0
         self.queue: deque[ModuleEvent] = deque(maxlen=EVENTS)
         self.arrived = asyncio.Event()
         self.closed = False

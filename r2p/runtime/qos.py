@@ -1,5 +1,6 @@
 """The three classes of publisher as values (thesis 5.3.6), and their reports to callbacks."""
 
+import enum
 from collections.abc import Callable
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
@@ -33,6 +34,28 @@ class Missed(msgspec.Struct, frozen=True):
 
 
 Signal = Callable[[Missed], object]
+
+
+class SignalKind(enum.Enum):
+    """The kinds of signals: a message was missed, or late; or a link no longer meets the class."""
+
+    MISSED = "missed"
+    LATE = "late"
+    DEGRADED = "degraded"
+
+
+class PublisherSignal(msgspec.Struct, frozen=True):
+    """A signal of a publisher, as `TopicSpace.signal_listeners` get it.
+
+    `sequence` is that of the message (0: unknown). A message that is missed on several links has a signal for each, and
+    only the first of them counts it (`missed.count`).
+    """
+
+    kind: SignalKind
+    node: str
+    publisher_class: PublisherClass
+    sequence: int
+    missed: Missed
 
 
 class NonRealTime(msgspec.Struct, frozen=True, kw_only=True):

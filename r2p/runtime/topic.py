@@ -7,7 +7,7 @@ waits: full sinks worth waiting for are returned to the publisher, whose class d
 import abc
 import asyncio
 from collections.abc import Callable, Hashable, Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 from weakref import WeakValueDictionary
 
 from r2p.clock import Clock
@@ -19,6 +19,9 @@ from r2p.runtime.accepting import AcceptedTypes
 from r2p.runtime.backpressure import Sink, WaitQueue
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue, WakeScheduler
 from r2p.runtime.sample import LastReceived, PublisherClass, Sample, Source
+
+if TYPE_CHECKING:
+    from r2p.runtime.qos import PublisherSignal
 
 
 class RemoteSubscriber(Sink):
@@ -349,6 +352,8 @@ class TopicSpace:
         self.links: list[LinkView] = []
         self.make_topic: Callable[[str, WakeScheduler], Topic] = Topic
         """The class of the topics; a gateway has its own."""
+        self.signal_listeners: list[Callable[[PublisherSignal], object]] = []
+        """Get each signal of each publisher of this module, also those that the log leaves out; they must not raise."""
         self.changed: Callable[[Topic], None] = lambda _topic: None
         """Callback after a publisher or a subscriber of this module was added or removed."""
 

@@ -19,7 +19,7 @@ from r2p.errors import Closed, MessageError
 from r2p.log_lines import LineLimit
 from r2p.messages import Layout, Message
 from r2p.runtime.backpressure import LINK_DOWN, Sink
-from r2p.runtime.qos import Missed, NonRealTime, Periodic, Signal, Sporadic
+from r2p.runtime.qos import Missed, NonRealTime, Periodic, PublisherSignal, Signal, SignalKind, Sporadic
 from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, Pulse
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic, TopicSpace
@@ -212,7 +212,7 @@ class BasePublisher(Generic[M, C]):
 
     def link_degraded(self, link: str, reason: str) -> None:
         """Report that a link no longer carries the topic, or has lost its slots."""
-        self._report(Missed(self.topic, reason, where=link, count=0), self._on_degraded)
+        self._report(SignalKind.DEGRADED, Missed(self.topic, reason, where=link, count=0), self._on_degraded)
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
         """Report that a link gave up an accepted message, such as one for a slot that has passed; `late` is in seconds.
@@ -224,7 +224,7 @@ class BasePublisher(Generic[M, C]):
     def link_late(self, link: str, reason: str, late: float = 0.0) -> None:
         """Report that a link sent a message after its deadline; `late` is in seconds."""
         self.late += 1
-        self._report(Missed(self.topic, reason, link, late), self._on_late)
+        self._report(SignalKind.LATE, Missed(self.topic, reason, link, late), self._on_late)
 
     # For the classes below
 
@@ -251,9 +251,11 @@ class BasePublisher(Generic[M, C]):
         self.missed += is_first
         # `_report`, inlined: with a full queue this runs for each message, mostly without a line and a callback.
         suffix = None if reason == LINK_DOWN else self._log_limit.suffix("", self._clock.monotonic())
-        if self._on_missed is not None or suffix is not None:
+        if self._on_missed is not None or suffix is not None or self._space.signal_listeners:
             names = without if isinstance(without, str) else where(without)
-            self._log_and_call(Missed(self.topic, reason, names, late, int(is_first)), self._on_missed, suffix)
+            missed = Missed(self.topic, reason, names, late, int(is_first))
+            self._inform(SignalKind.MISSED, missed, sequence)
+            self._log_and_call(missed, self._on_missed, suffix)
 
     def _is_first_miss(self, sequence: int) -> bool:
         """Return whether this message has not been missed yet. One without a number counts each time."""
@@ -271,10 +273,15 @@ class BasePublisher(Generic[M, C]):
             sink.force(sample)
         self._miss(sample.sequence, LINK_DOWN, sinks)
 
-    def _report(self, missed: Missed, callback: Signal | None) -> None:
+    def _report(self, kind: SignalKind, missed: Missed, callback: Signal | None) -> None:
         """Log the miss, and call the user's callback; a link that is down has been logged as such."""
+        self._inform(kind, missed)
         suffix = None if missed.reason == LINK_DOWN else self._log_limit.suffix("", self._clock.monotonic())
         self._log_and_call(missed, callback, suffix)
+
+    def _inform(self, kind: SignalKind, missed: Missed, sequence: int = 0) -> None:
+        for listener in self._space.signal_listeners:
+            listener(PublisherSignal(kind, self.node.name, self.publisher_class, sequence, missed))
 
     def _log_and_call(self, missed: Missed, callback: Signal | None, suffix: str | None) -> None:
         if suffix is not None:

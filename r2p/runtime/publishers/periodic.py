@@ -18,7 +18,7 @@ from r2p.errors import MessageError
 from r2p.messages import Layout
 from r2p.runtime.backpressure import GIVEN_UP, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
-from r2p.runtime.qos import Missed, Periodic
+from r2p.runtime.qos import Missed, Periodic, SignalKind
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import SlotPublisher, Topic, TopicSpace
@@ -123,7 +123,7 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
             self.late += 1
             self.skipped += skipped
             reason = f"{skipped} period(s) skipped, the next one late" if skipped else "late"
-            self._report(Missed(self.topic, reason, late=late / SECOND, count=skipped), self._on_late)
+            self._report(SignalKind.LATE, Missed(self.topic, reason, late=late / SECOND, count=skipped), self._on_late)
         try:
             message = self._class.fill()
             if message is None or self._encode == self._closed:  # fill may have closed it
@@ -161,7 +161,7 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
             self._miss(delivery.sample.sequence, reason, [sink])
         elif late > self.period * SECOND / _LATE_SHARE:
             self.late += 1
-            self._report(Missed(self.topic, "sent late", where([sink]), late / SECOND), self._on_late)
+            self._report(SignalKind.LATE, Missed(self.topic, "sent late", where([sink]), late / SECOND), self._on_late)
 
     def _wrong_type(self, message: object) -> MessageError:
         error = super()._wrong_type(message)

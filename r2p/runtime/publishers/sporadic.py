@@ -6,7 +6,7 @@ from r2p.clock import Alarm
 from r2p.messages import Layout
 from r2p.runtime.backpressure import GIVEN_UP, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
-from r2p.runtime.qos import Missed, Sporadic
+from r2p.runtime.qos import Missed, SignalKind, Sporadic
 from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, checkpoint
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic, TopicSpace
@@ -112,7 +112,9 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
                 event.overdue = True
                 self.late += 1
                 late = (now - event.due) / SECOND
-                self._report(Missed(self.topic, _TOO_LATE, where(event.remaining), late), self._on_late)
+                self._report(
+                    SignalKind.LATE, Missed(self.topic, _TOO_LATE, where(event.remaining), late), self._on_late
+                )
             else:
                 self._give_up(event, _TOO_LATE)
         self._arm()

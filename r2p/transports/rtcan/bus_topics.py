@@ -5,6 +5,8 @@
 While discovery knows a subscriber, one r2p module of the bus publishes them, and receives all frames for that. Without
 a subscriber they are not advertised, and cost nothing. All modules decide alike which one it is: a gateway, if there is
 one, as subscribers are likely to be behind it, and the numbers themselves then need no bus.
+
+A module on the bus can also have them for itself, without a message on the bus: `RtcanLink.bus_listeners`.
 """
 
 import asyncio
@@ -50,14 +52,14 @@ class BusReporter:
         self._space = hub.space
         self._subscribers = _Subscribers(hub)
         self._wanted_since: int | None = None
-        self._refused = False
+        self._refused = self._watching = False
         self._node: Node | None = None
         self._publishers: dict[str, Publisher[Any]] = {}
         self._publishing: asyncio.Task[None] | None = None
         # A callback, and no task that sleeps: under virtual time it keeps no program going.
         self._alarm = Alarm(hub.space.loop, self._look, background=True)
-        if not hub.observer:
-            self._alarm.set(self._space.clock.monotonic() + _LOOK_INTERVAL)
+        self._observer = hub.observer
+        self._alarm.set(self._space.clock.monotonic() + _LOOK_INTERVAL)
 
     def close(self) -> None:
         """Stop for good."""
@@ -72,13 +74,15 @@ class BusReporter:
             self._link.stats.lost.guard(self._begin)
 
     def _begin(self) -> None:
-        if self._wanted():
+        if self._link.bus_listeners or self._wanted():
             self._publishing = self._space.loop.create_task(self._publish(), name=f"{self._link.name} bus topics")
 
     # Whether this module publishes
 
     def _wanted(self) -> set[str]:
-        """Return the topics that this module is to publish now."""
+        """Return the topics that this module is to publish now; a tool publishes none."""
+        if self._observer:
+            return set()
         now, discovery = self._space.clock.monotonic(), self._link.discovery
         wanted = {topic for topic in _TYPES if self._subscribers.of(topic) and not self._is_other_topic(topic)}
         if not wanted or not self._link.up or self._refused:
@@ -111,7 +115,7 @@ class BusReporter:
     # Publishing
 
     async def _publish(self) -> None:
-        """Publish once a second, until another module takes over."""
+        """Publish once a second, until another module takes over and no listener is left."""
         try:
             await self._publish_while_wanted()
         except TypeMismatch as error:
@@ -130,7 +134,8 @@ class BusReporter:
         end = driver.now()
         watching.reset(end, SECOND)
         driver.watch(watching)
-        while wanted := self._wanted():
+        self._watching = True
+        while (wanted := self._wanted()) or self._link.bus_listeners:
             self._advertise(wanted)
             self._learn_names(watching)  # early: frames of the next second end this one
             if driver.now() < end + SECOND + _READ_AFTER:
@@ -141,28 +146,34 @@ class BusReporter:
             load = watching.next_load()
             if driver.now() >= end + SECOND + _READ_AFTER:
                 continue  # the program stood still: only the last second counts
+            changed = owners.update(load.slots, self._link.master, self._subscribers.of(BUS_SLOTS))
+            for listener in list(self._link.bus_listeners):
+                slots = [self._slot_row(*each, watching) for each in owners.owned.items()]
+                listener(list(self._load_rows(load)), slots)
             if BUS_LOAD in self._publishers:
                 for row in self._load_rows(load):
                     await self._publishers[BUS_LOAD].publish(row)
             if BUS_SLOTS in self._publishers:
-                slots = owners.update(load.slots, self._master(), self._subscribers.of(BUS_SLOTS))
-                for owner, indices in slots:
+                for owner, indices in changed:
                     await self._publishers[BUS_SLOTS].publish(self._slot_row(owner, indices, watching))
 
     def _advertise(self, wanted: set[str]) -> None:
         """Advertise the topics that are wanted now, and no others."""
-        if self._node is None:
+        if self._node is None and wanted:
             # With a node for each bus, as the messages of two publishers of one node would count as repetitions.
             self._node = Node("bus_" + re.sub(r"\W", "_", self._link.name, flags=re.ASCII)[:_BUS_MAX], self._space)
         for topic in wanted - self._publishers.keys():
+            assert self._node is not None
             self._publishers[topic] = self._node.advertise(topic, _TYPES[topic])
         for topic in self._publishers.keys() - wanted:
             self._publishers.pop(topic).close()
 
     def _end(self) -> None:
         """Leave the bus to itself."""
-        if self._node is not None:
+        if self._watching:
+            self._watching = False
             self._link.driver.watch(None)
+        if self._node is not None:
             self._node.close()
         self._node = None
         self._publishers.clear()
@@ -176,14 +187,6 @@ class BusReporter:
         directory = watching.directory
         directory.modules |= names | {self._link.engine.id8 or 0: self._space.module}
         directory.topics |= self._link.topics_on_bus()
-
-    def _master(self) -> str:
-        """Return the module that is the master; empty if it is not known."""
-        id8, discovery = self._link.engine.network.master, self._link.discovery
-        if id8 is not None and id8 == self._link.engine.id8:
-            return self._space.module
-        known = (each.name for each in discovery.modules.values() if each.source == id8 and not each.hops)
-        return next(known, "") if id8 else ""
 
     def _load_rows(self, load: monitor.BusLoad) -> Iterator[BusTraffic]:
         bus, seconds = _cut(self._link.title, _BUS_MAX), load.elapsed / SECOND
@@ -202,7 +205,7 @@ class BusReporter:
                 bus=bus,
                 kind=kind.value,
                 topic=self._short(topic),
-                module=_cut(module or (self._master() if kind is FrameKind.SYNC else ""), _MODULE_MAX),
+                module=_cut(module or (self._link.master if kind is FrameKind.SYNC else ""), _MODULE_MAX),
                 share=load.share(tally.bits),
                 frames=tally.frames / seconds,
             )
@@ -228,7 +231,8 @@ class _SlotOwners:
 
     def __init__(self) -> None:
         self._by_slot: dict[int, list[_Owner]] = {}
-        self._sent: dict[_Owner, tuple[int, ...]] = {}
+        self.owned: dict[_Owner, tuple[int, ...]] = {}
+        """The slots of each owner now."""
         self._known_to: frozenset[Hashable] = frozenset()
         self._resend = 0
 
@@ -238,9 +242,9 @@ class _SlotOwners:
         """Enter the slots of the last second; return those owners with their slots that subscribers are to get."""
         self._resend = _RESENT if subscribers - self._known_to else max(0, self._resend - 1)
         self._known_to = subscribers
-        before, self._sent = self._sent, self._by_owner(slots, master)
-        gone: list[tuple[_Owner, tuple[int, ...]]] = [(owner, ()) for owner in before if owner not in self._sent]
-        return gone + [each for each in self._sent.items() if self._resend or before.get(each[0]) != each[1]]
+        before, self.owned = self.owned, self._by_owner(slots, master)
+        gone: list[tuple[_Owner, tuple[int, ...]]] = [(owner, ()) for owner in before if owner not in self.owned]
+        return gone + [each for each in self.owned.items() if self._resend or before.get(each[0]) != each[1]]
 
     def _by_owner(self, slots: list[monitor.BusSlot], master: str) -> dict[_Owner, tuple[int, ...]]:
         owned: dict[_Owner, list[int]] = {}

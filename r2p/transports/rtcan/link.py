@@ -6,7 +6,7 @@ the node has an id8, and everything is announced again when it gets another one.
 """
 
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, ClassVar
 
 import msgspec
@@ -14,6 +14,7 @@ import msgspec
 from r2p.codecs import can_bits, management, rtcan
 from r2p.codecs.management import NO_PARAMS
 from r2p.messages import ClockOffset
+from r2p.msg import BusSlots, BusTraffic
 from r2p.names import MANAGEMENT
 from r2p.protocols.can_orders import Mailbox
 from r2p.protocols.discovery.events import Event, ModuleGone, PublisherFound, PublisherGone
@@ -71,6 +72,10 @@ _CLASSES = {
 }
 
 
+BusListener = Callable[[list[BusTraffic], list[BusSlots]], object]
+"""Takes what `bus_load` and `bus_slots` have, complete. It must not raise."""
+
+
 class ReceivedMessage(msgspec.Struct, frozen=True, gc=False):
     """A complete received message."""
 
@@ -106,6 +111,8 @@ class RtcanLink(BufferedLink):
         self.engine = Engine(settings)
         self.stats.faults = self.engine.counts  # one counter for what goes wrong in the engine and on the bus
         self.driver = EngineDriver(self.engine, port, self)
+        self.bus_listeners: list[BusListener] = []
+        """Get what is on the bus, once a second. While there are any, the port receives all frames."""
         self._utc_error = utc_error
         self._utc = UtcEstimator(self.driver)
         self._utc_offset = 0  # of UTC from the monotonic clock (ns)
@@ -405,6 +412,15 @@ class RtcanLink(BufferedLink):
         if self._message_ids.end_lingering(now):
             self.driver.update_filters()
         super()._poll()
+
+    @property
+    def master(self) -> str:
+        """The module that is the master; empty if there is none, or its name is not known."""
+        id8 = self.engine.network.master
+        if id8 is not None and id8 == self.engine.id8:
+            return self._space.module
+        known = (each.name for each in self.discovery.modules.values() if each.source == id8 and not each.hops)
+        return next(known, "") if id8 else ""
 
     # Life
 
