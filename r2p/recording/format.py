@@ -1,6 +1,7 @@
 """What a bag is: an MCAP file (https://mcap.dev) of profile `ros2`, with r2p's own channels and metadata.
 
     metadata record `r2p`   `format`: FORMAT; `r2p`: the version of r2p that wrote the file
+    metadata `r2p/latched`  a key for each topic that its publisher latches; of several such records, the last counts
     channel /TOPIC          the messages of one publisher, in one class, by one link: `ChannelInfo` in its metadata.
                             Encoding `cdr` with a `ros2msg` schema; `r2p`, without one, if their type is unknown
     channel /r2p/meta/TOPIC its companion, with the same metadata: what of a message is not the default (`SampleMeta`)
@@ -27,6 +28,8 @@ FORMAT = 1
 PROFILE = "ros2"
 METADATA = "r2p"
 """The name of the metadata record."""
+LATCHED = "r2p/latched"
+"""The name of the one with the topics that are latched."""
 
 CDR = "cdr"
 PACKED = "r2p"

@@ -34,6 +34,7 @@ FASTEST: Final = 10_000.0
 """The limits of the rate, times the speed of the recording."""
 
 _LATE_MAX: Final = 100 * MILLISECOND  # ns that playing makes up for; after a longer stop all that follows is put off
+_UTC_ERROR_MAX: Final = 5 * MILLISECOND
 _PER_TURN: Final = 64  # records that are played in one turn of the event loop
 _BATCH: Final = 32  # records that are read at once: 0.3 ms, for which the loop may wait
 _BATCH_BYTES: Final = 1 << 20
@@ -63,6 +64,7 @@ class Pacer:
         self._paused = False
         self._recorded = 0
         self._monotonic = self._clock.monotonic()
+        self._utc = self._clock.now()
         self._streams: list[PacedStream[Any]] = []
 
     @property
@@ -89,7 +91,7 @@ class Pacer:
 
     def begin(self, recorded: int) -> None:
         """Go to this instant of the recording; what streams have read ahead stays, and is played when it is due."""
-        self._recorded, self._monotonic = recorded, self._clock.monotonic()
+        self._recorded, self._monotonic, self._utc = recorded, self._clock.monotonic(), self._clock.now()
         self._rearm()
 
     def pause(self) -> None:
@@ -117,6 +119,19 @@ class Pacer:
             return None
         return self._monotonic + round((recorded - self._recorded) / self._rate)
 
+    def utc(self, recorded: int) -> int:
+        """Return the time at which an instant of the recording is played (UTC, ns); what is played late has no delay.
+
+        So stamps have the distances that they had, whatever the delays of this computer are.
+        """
+        now, due = self._clock.now(), self.instant(recorded)
+        if due is None:
+            return now
+        error = now - (self._clock.monotonic() - due) - (self._utc + due - self._monotonic)
+        if abs(error) > _UTC_ERROR_MAX:
+            self._utc += error  # UTC was set
+        return self._utc + due - self._monotonic
+
     def behind(self, late: int) -> None:
         """Note that a record is late by so many ns; after a stop all that follows is put off, and not played at once.
 
@@ -125,6 +140,7 @@ class Pacer:
         if late > _LATE_MAX:
             self.put_off += late
             self._monotonic += late
+            self._utc += late
             self._rearm()
 
     def add(self, stream: "PacedStream[Any]") -> None:

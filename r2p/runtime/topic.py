@@ -14,6 +14,7 @@ from r2p.clock import Clock
 from r2p.codecs.management import ANY_TYPE
 from r2p.errors import TypeMismatch
 from r2p.messages import Layout
+from r2p.protocols.discovery.events import TopicType
 from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.accepting import AcceptedTypes
 from r2p.runtime.backpressure import Sink, WaitQueue
@@ -119,6 +120,8 @@ class Topic:
     def __init__(self, name: str, wake_scheduler: WakeScheduler) -> None:
         self.name = name
         self.layout: Layout[Any] | None = None
+        self.unnamed_type = TopicType()
+        """The size of the messages of a topic without a layout, such as one of a recording; links announce it."""
         self.publishers: list[PublisherHandle] = []
         # Both lists are replaced at a change, never changed in place: a sink may call the user's code, such as when a
         # write breaks a line, and that code may close entries while a sample is on its way through them.
@@ -397,6 +400,6 @@ class TopicSpace:
         """Inform the links of a change; forget the topic's type with its last user, and the topic if no link has it."""
         self.changed(topic)
         if topic.unused:
-            topic.layout = None
+            topic.layout, topic.unnamed_type = None, TopicType()
             if not topic.in_use:
                 self.topics.pop(topic.name, None)

@@ -62,7 +62,7 @@ class GatewayHooks(Protocol):
 
 def type_of(topic: Topic) -> TopicType:
     """The size and fingerprint of a topic's messages, as far as this module knows them."""
-    return TopicType() if topic.layout is None else _type_of_layout(topic.layout)
+    return topic.unnamed_type if topic.layout is None else _type_of_layout(topic.layout)
 
 
 def _type_of_layout(layout: Layout[Any]) -> TopicType:
