@@ -18,11 +18,10 @@ from r2p.recording.bag_file import Attachment, BagFile, Paths, bag_paths
 from r2p.recording.channels import BagChannel, M
 from r2p.recording.format import CDR, METADATA, ChannelInfo
 from r2p.recording.messages import SampleMeta
-from r2p.recording.records import ChunkRef, RawMessage
+from r2p.recording.records import TIME_MAX, ChunkRef, RawMessage
 from r2p.recording.samples import sample_of
 from r2p.ros.cdr import cdr
 from r2p.runtime.sample import Sample
-from r2p.units import NEVER
 
 C = TypeVar("C", covariant=True)
 
@@ -90,16 +89,17 @@ class Bag:
         or is still at work, is read as far as it goes, and the log says so: see `problems`.
         """
         self.paths = bag_paths(path)
-        self._files: list[BagFile] = []
+        self.files: list[BagFile] = []
+        """The files of the recording, for those who copy their chunks."""
         try:
             for each in self.paths:
-                self._files.append(BagFile(each))
+                self.files.append(BagFile(each))
         except BagError:
             self.close()
             raise
         self.undecodable: Counter[str] = Counter()
         """Messages that could not be read, by topic or channel."""
-        self.damaged = sum(each.summary.damaged for each in self._files)
+        self.damaged = sum(each.summary.damaged for each in self.files)
         """Chunks that could not be read."""
         for problem in self.problems:
             logger.warning("%s", problem)
@@ -114,7 +114,7 @@ class Bag:
 
     def close(self) -> None:
         """Close the files."""
-        for each in self._files:
+        for each in self.files:
             each.file.close()
 
     @property
@@ -122,25 +122,25 @@ class Bag:
         """What is wrong with the files, each with advice; empty if they all end as they should."""
         return [
             f"{each.file.path} {each.summary.problem}; r2p bag recover {each.file.path} makes a whole file of it"
-            for each in self._files
+            for each in self.files
             if each.summary.problem
         ]
 
     @functools.cached_property
     def start(self) -> int:
         """The log time of the first message (UTC, ns); 0 for a bag without messages."""
-        return min((each.summary.start for each in self._files if each.summary.counts.total()), default=0)
+        return min((each.summary.start for each in self.files if each.summary.counts.total()), default=0)
 
     @functools.cached_property
     def end(self) -> int:
         """The log time of the last message (UTC, ns); 0 for a bag without messages."""
-        return max((each.summary.end for each in self._files if each.summary.counts.total()), default=0)
+        return max((each.summary.end for each in self.files if each.summary.counts.total()), default=0)
 
     @functools.cached_property
     def channels(self) -> list[BagChannel]:
         """The channels of all files; one that several files have is there once."""
         found: dict[object, BagChannel] = {}
-        for each in self._files:
+        for each in self.files:
             for channel in each.channels.values():
                 key = (channel.name, channel.encoding, tuple(channel.metadata.items()), channel.schema_name)
                 known = found.get(key)
@@ -159,12 +159,12 @@ class Bag:
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records by name, without that of the format; the last of a name."""
-        return {name: values for each in self._files for name, values in each.metadata() if name != METADATA}
+        return {name: values for each in self.files for name, values in each.metadata() if name != METADATA}
 
     def attachments(self) -> Iterator[Attachment]:
         """Read the attachments that can be read; those that each part of a recording has, once."""
         seen = set()
-        for file in self._files:
+        for file in self.files:
             for each in file.attachments():
                 if (each.name, each.time) not in seen:
                     seen.add((each.name, each.time))
@@ -246,7 +246,7 @@ class Bag:
             if log_time != now:
                 now = log_time
                 metas.clear()
-            channel = self._files[number].channels[channel_id]
+            channel = self.files[number].channels[channel_id]
             info = channel.info
             assert info is not None
             try:
@@ -299,7 +299,7 @@ class Bag:
     ) -> Iterator[RawRecord]:
         """Iterate over the messages of all channels, or of those wanted, as they are in the file."""
         for number, (log_time, channel_id, sequence, publish_time, data) in self._messages(wanted, start, end):
-            yield RawRecord(self._files[number].channels[channel_id], log_time, publish_time, sequence, data)
+            yield RawRecord(self.files[number].channels[channel_id], log_time, publish_time, sequence, data)
 
     def last_before(self, time: int, topics: Collection[str] | None = None) -> list[RecordedSample]:
         """Return the last sample of each channel before `time` (UTC, ns), if it has one: what a late subscriber gets.
@@ -318,7 +318,7 @@ class Bag:
         """Return the last log time of each channel with samples before `time`."""
         chunks = self._chunks(is_of(topics, {"samples"}), 0, time)
         last: dict[tuple[int, int], int] = {}
-        done: dict[int, set[int]] = {number: set() for number in range(len(self._files))}
+        done: dict[int, set[int]] = {number: set() for number in range(len(self.files))}
         for chunk, number, ids in sorted(chunks, key=lambda each: -each[0].end):
             settled = done[number]
             settled.update(channel for (file, channel), at in last.items() if file == number and at >= chunk.end)
@@ -327,7 +327,7 @@ class Bag:
                 for message in self._read(number, chunk, wanted, 0, time):
                     key = (number, message[1])
                     last[key] = max(message[0], last.get(key, 0))
-        return [(self._files[number].channels[channel], at) for (number, channel), at in last.items()]
+        return [(self.files[number].channels[channel], at) for (number, channel), at in last.items()]
 
     def _messages(
         self, wanted: Callable[[BagChannel], bool] | None, start: int | None, end: int | None
@@ -336,7 +336,7 @@ class Bag:
 
         Those with the same time stay in the order of the file. A chunk is read when its turn comes.
         """
-        first, last = 0 if start is None else start, NEVER * 4 if end is None else end
+        first, last = 0 if start is None else start, TIME_MAX + 1 if end is None else end
         chunks = self._chunks(wanted, first, last)
         held: list[tuple[int, int, RawMessage]] = []
         size = 0
@@ -355,7 +355,7 @@ class Bag:
     def _read(self, number: int, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int) -> list[RawMessage]:
         """Return the messages of a chunk; none if it can't be read, which is counted."""
         try:
-            return self._files[number].messages(chunk, ids, start, end)
+            return self.files[number].messages(chunk, ids, start, end)
         except BagError as error:
             self.damaged += 1
             if self.damaged == 1:
@@ -367,7 +367,7 @@ class Bag:
     ) -> list[tuple[ChunkRef, int, frozenset[int] | None]]:
         """Return the chunks with such messages in the order of time, with their file and the ids of channels."""
         found = []
-        for number, file in enumerate(self._files):
+        for number, file in enumerate(self.files):
             ids = None if wanted is None else frozenset(key for key, each in file.channels.items() if wanted(each))
             for chunk in file.summary.chunks:
                 is_in_time = chunk.end >= start and chunk.start < end

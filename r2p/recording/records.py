@@ -30,6 +30,9 @@ RECORD_HEAD: Final = struct.Struct("<BQ")
 CHUNK_MAX: Final = 1 << 30
 """Bytes of messages in one chunk, at most; of a larger one nothing is read."""
 
+TIME_MAX: Final = (1 << 64) - 1
+"""The last instant that a file can have (UTC, ns)."""
+
 _RECORD_MAX: Final = 1 << 28  # bytes of a record that is neither a chunk nor an attachment
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # start, end, size, CRC, length of the name of the compression
 _LENGTH: Final = struct.Struct("<Q")
@@ -236,6 +239,6 @@ def parse(record: type[R], body: bytes) -> R:
     reader: Any = record
     try:
         found: R = reader.read(ReadDataStream(BytesIO(body)))
-    except (McapError, struct.error, ValueError) as error:
+    except (McapError, struct.error, ValueError, OverflowError) as error:
         raise BagError(f"a record is damaged: {error}") from error
     return found

@@ -17,13 +17,13 @@ from r2p.errors import BagError
 from r2p.recording.records import (
     MAGIC,
     RECORD_HEAD,
+    TIME_MAX,
     ChunkRef,
     RecordFile,
     messages,
     other_records,
     parse,
 )
-from r2p.units import NEVER
 
 _FOOTER: Final = RECORD_HEAD.size + 20 + len(MAGIC)  # bytes of the footer and of the magic behind it
 _SECTION_MAX: Final = 1 << 28  # bytes of a summary
@@ -254,7 +254,7 @@ class _Walk:
         data = self._file.chunk(chunk)
         for opcode, body in other_records(data):
             self._found.add(opcode, body)
-        return Counter(message[1] for message in messages(data, None, 0, NEVER))
+        return Counter(message[1] for message in messages(data, None, 0, TIME_MAX + 1))
 
     def _metadata(self, length: int) -> None:
         body = self._file.body(self._at, Opcode.METADATA)

@@ -14,50 +14,10 @@ import r2p
 from r2p.msg import Led, Odometry
 from r2p.recording.bag import Bag
 from r2p.recording.messages import SampleMeta
-from r2p.recording.samples import SampleWriter
 from r2p.recording.types import schema_of
 from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import cdr
-
-T0 = 1_700_000_000_000_000_000
-MS = 1_000_000
-Samples = list[tuple[str, r2p.Sample, type[r2p.Message] | None, int]]
-
-
-def led(number: int, *, deadline: int = 0, source: str = "IMU") -> r2p.Sample:
-    stamp = T0 + number * MS
-    return r2p.Sample(
-        Led(number % 8, 1).encode(), r2p.Source(source, "leds", "tcp"), stamp, deadline and stamp + deadline, number
-    )
-
-
-def leds(count: int, first: int = 1) -> Samples:
-    """Each third has a deadline, and so a companion; they are received 1 ms after their stamp."""
-    numbers = range(first, first + count)
-    return [("leds", led(i, deadline=0 if i % 3 else 20 * MS), Led, T0 + (i + 1) * MS) for i in numbers]
-
-
-def write(path: Path, samples: Samples, *, chunk_size: int = 200, finish: bool = True) -> Path:
-    with path.open("wb") as file:
-        writer = BagWriter(file, chunk_size=chunk_size)
-        add = SampleWriter(writer)
-        for topic, sample, cls, log_time in samples:
-            add.write(topic, sample, cls, log_time)
-        writer.attach("r2p.toml", "text/plain", b"via = []", T0)
-        writer.add_metadata("robot", {"name": "carrot"})
-        if finish:
-            writer.finish()
-        else:
-            writer.flush()
-    return path
-
-
-def plain(bag: Bag, start: int | None = None, end: int | None = None) -> list[tuple[str, r2p.Sample, int]]:
-    return [(each.topic, each.sample, each.log_time) for each in bag.records(start=start, end=end)]
-
-
-def of(samples: Samples) -> list[tuple[str, r2p.Sample, int]]:
-    return [(topic, sample, log_time) for topic, sample, _, log_time in samples]
+from tests.recording.making import MS, T0, led, leds, of, plain, write
 
 
 def test_a_bag_says_what_it_has(tmp_path: Path) -> None:
