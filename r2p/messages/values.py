@@ -275,7 +275,7 @@ def _value(shape: Shape, plain: Any, path: str) -> Any:
         case Nested(inner) if isinstance(plain, Mapping):
             return _message(inner, plain, path)
         case FixedArray() | VariableArray():
-            value = _elements(shape, _bytes(plain) if _is_bytes(shape) and isinstance(plain, str) else plain, path)
+            value = _elements(shape, _bytes(plain) if is_octets(shape) and isinstance(plain, str) else plain, path)
         case Chars() | VariableText():
             value = plain if isinstance(plain, str) else _invalid
         case Scalar():
@@ -304,7 +304,8 @@ def _elements(shape: FixedArray | VariableArray, plain: Any, path: str) -> Any:
             return tuple(values)
 
 
-def _is_bytes(shape: Shape) -> bool:
+def is_octets(shape: Shape) -> bool:
+    """Return whether a field is an array of u8, such as the bytes of an image."""
     return isinstance(shape, FixedArray | VariableArray) and shape.item == _BYTE
 
 
@@ -327,7 +328,7 @@ def _wanted(shape: Shape) -> str:
         case FixedArray(_, count):
             return f"a list of {count}"
         case VariableArray(_, limit):
-            return f"a list of at most {limit}{', or their base64' if _is_bytes(shape) else ''}"
+            return f"a list of at most {limit}{', or their base64' if is_octets(shape) else ''}"
         case Scalar("bool"):
             return "true or false"
         case _:
@@ -383,7 +384,7 @@ def _plain(shape: Shape, value: Any, form: Form) -> Any:
     match shape:
         case Nested(inner):
             return {field.wire_name: _plain(field.shape, getattr(value, field.name), form) for field in inner.fields}
-        case VariableArray() if _is_bytes(shape) and (form != "short" or len(value) > _LONG):
+        case VariableArray() if is_octets(shape) and (form != "short" or len(value) > _LONG):
             return f"<bytes {len(value)}>" if form == "short" else base64.b64encode(bytes(value)).decode()
         case VariableArray(item) if form == "cells":
             return json.dumps([_plain(item, each, "whole") for each in value])

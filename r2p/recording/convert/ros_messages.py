@@ -1,0 +1,87 @@
+"""Messages of ROS as they are in recordings: their types, and their bytes as those that r2p packs."""
+
+import functools
+from collections import Counter
+from collections.abc import Callable
+
+import msgspec
+
+from r2p.messages import Message, layout
+from r2p.recording.types import schema_of
+from r2p.ros.classes import definitions_of, standard_classes
+from r2p.ros.definitions import definition_text
+from r2p.ros.library import definitions_of_ros, definitions_with_those_of_ros, ros1_md5, ros2_hash
+from r2p.ros.packages import OF_ROS
+from r2p.ros.stamps import StampSource
+from r2p.ros.topics import ros_class
+from r2p.ros.transcoding import transcoder
+from r2p.ros.type_names import ros2_name, short_name
+
+
+class RosDecoder(msgspec.Struct, frozen=True):
+    """What reads the messages of one type of ROS 1 or 2. Calling it returns a message as r2p packs it, and its own
+    stamp (UTC, ns; 0: none); it raises DecodeError.
+    """
+
+    cls: type[Message]
+    pack: Callable[[bytes], bytes]
+    own_stamp: Callable[[bytes], int]
+
+    def __call__(self, data: bytes) -> tuple[bytes, int]:
+        packed = self.pack(data)
+        own = self.own_stamp(packed)
+        return packed, own if own >= StampSource.OLDEST_UTC else 0
+
+
+@functools.lru_cache(maxsize=1024)
+def ros_decoder(name: str, version: int, definition: str) -> RosDecoder:
+    """Return the decoder of a type; without a definition it is the one of its name that comes with ROS.
+
+    Raises MessageError for a type that is unknown, or that r2p has no class for.
+    """
+    cls = _standard(ros_class(short_name(name), version, definition), version)
+    own_stamp = StampSource(cls, Counter()).own
+    if version == 1:
+        return RosDecoder(cls, _checked(cls), own_stamp)
+    from_cdr = transcoder(cls).from_cdr
+    return RosDecoder(cls, lambda data: from_cdr(data, b""), own_stamp)
+
+
+def _standard(cls: type[Message], version: int) -> type[Message]:
+    """Return the class of r2p.msg with this name and these fields in ROS, where texts of fixed length are octets."""
+    known = standard_classes().get(layout(cls).name)
+    return known if known is not None and definitions_of(known, version) == definitions_of(cls, version) else cls
+
+
+def _checked(cls: type[Message]) -> Callable[[bytes], bytes]:
+    """Return what passes bytes of ROS 1 on, which are those of r2p, if they are of this type."""
+    decode = layout(cls).decode
+
+    def check(data: bytes) -> bytes:
+        decode(data)
+        return data
+
+    return check
+
+
+class RosSchema(msgspec.Struct, frozen=True):
+    """What a recording of ROS has of a type: its name, its definition with those in it, and its checksum."""
+
+    name: str
+    definition: str
+    checksum: str
+
+
+@functools.lru_cache(maxsize=1024)
+def ros_schema(cls: type[Message], version: int) -> RosSchema:
+    """Return the schema of a message class in ROS 1 or 2.
+
+    Raises MessageError for one that ROS can't define, or that has other fields than ROS's type of its name.
+    """
+    if version > 1:
+        schema = schema_of(cls)
+        return RosSchema(schema.name, schema.text, ros2_hash(cls))
+    name = layout(cls).name
+    of_ros = name.partition("/")[0] in OF_ROS
+    found = definitions_of_ros(name, 1) if of_ros else definitions_with_those_of_ros(cls, 1)
+    return RosSchema(ros2_name(name), definition_text(name, found), ros1_md5(cls))  # rosbags has such names

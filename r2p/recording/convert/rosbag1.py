@@ -1,0 +1,112 @@
+"""Recordings of ROS 1: `.bag` files, by rosbags. Messages of ROS 1 have the bytes that r2p packs."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rosbags.rosbag1 import Reader, ReaderError, Writer
+
+from r2p.errors import BagError, DecodeError, InvalidName, MessageError
+from r2p.names import topic_name
+from r2p.recording.convert.ros_messages import RosDecoder, ros_decoder, ros_schema
+from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
+from r2p.runtime.sample import Sample, Source
+from r2p.units import SECOND
+
+_LATEST = 1 << 32  # seconds since 1970 that a time of ROS 1 can't have any more
+
+
+def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedRecord]:
+    """Iterate over the messages. A publisher is the node of ROS that its connection names."""
+    try:
+        with Reader(path) as reader:
+            channels = {each.id: _channel(each, options) for each in reader.connections}
+            chosen = [each for each in reader.connections if channels[each.id] is not None]
+            for connection, time, data in reader.messages(chosen, options.start, options.end) if chosen else ():
+                found = channels[connection.id]
+                if isinstance(found, str):
+                    losses[found] += 1
+                elif found is not None:
+                    yield from _record(*found, time, data, losses)
+    except (ReaderError, AssertionError, KeyError, ValueError) as error:
+        raise BagError(f"{path} is damaged, or was not finished: {error}; `rosbag reindex` may help") from error
+
+
+def _channel(connection: Any, options: ConversionOptions) -> tuple[str, Source, RosDecoder] | str | None:
+    """Return topic, publisher and decoder of a connection; in words what is lost of it; None for what is left out."""
+    name = connection.topic
+    try:
+        topic = topic_name(name)
+        if not options.wants(topic):
+            return None
+        decoder = ros_decoder(connection.msgtype, 1, connection.msgdef.data)
+    except (InvalidName, MessageError) as error:
+        return f"messages of {name}: {error}"
+    *module, node = (connection.ext.callerid or "").strip("/").split("/")
+    return topic, Source("_".join(module), node), decoder
+
+
+def _record(
+    topic: str, source: Source, decoder: RosDecoder, time: int, data: bytes, losses: Losses
+) -> Iterator[ConvertedRecord]:
+    try:
+        packed, stamp = decoder(data)
+    except DecodeError:
+        losses[f"messages of {topic} that can't be decoded"] += 1
+        return
+    yield ConvertedRecord(topic, time, Sample(packed, source, stamp or time, stamped=stamp > 0), decoder.cls)
+
+
+def open_sink(path: Path, options: ConversionOptions, losses: Losses) -> "Rosbag1Sink":
+    """Begin a file."""
+    return Rosbag1Sink(path, losses)
+
+
+class Rosbag1Sink(RecordSink):
+    """Writes a `.bag` file, with a connection for each topic, type and publisher."""
+
+    def __init__(self, path: Path, losses: Losses) -> None:
+        super().__init__(losses)
+        self._writer = Writer(path)
+        self._writer.set_compression(Writer.CompressionFormat.LZ4)
+        self._writer.open()
+        self._connections: dict[object, Any] = {}
+
+    def put(self, record: ConvertedRecord) -> bool:
+        sample = record.sample
+        key = record.topic, record.cls, sample.source.module, sample.source.node
+        if key not in self._connections:
+            self._connections[key] = self._connect(record)
+        connection = self._connections[key]
+        if isinstance(connection, str):
+            return self.lose(connection)
+        if not 0 < record.log_time < _LATEST * SECOND:
+            return self.lose(f"messages of {record.topic} from before 1970 or after 2106")
+        self._writer.write(connection, record.log_time, sample.data)
+        self.count_context(sample)
+        return True
+
+    def finish(self) -> None:
+        self._writer.close()
+
+    def close(self) -> None:
+        if self._writer.bio is not None:  # after an error
+            self._writer.bio.close()
+
+    def _connect(self, record: ConvertedRecord) -> Any:
+        """Return the connection of a message; in words what is lost if there can't be one."""
+        if record.cls is None:
+            return f"messages of {record.topic}, whose type is unknown: --type {record.topic}=TYPE states it"
+        try:
+            schema = ros_schema(record.cls, 1)
+        except MessageError as error:
+            return f"messages of {record.topic}: {error}"
+        names = [each for each in (record.sample.source.module, record.sample.source.node) if each]
+        return self._writer.add_connection(
+            f"/{record.topic}",
+            schema.name,
+            msgdef=schema.definition,
+            md5sum=schema.checksum,
+            callerid="/" + "/".join(names or ["r2p"]),
+            latching=0,
+        )
