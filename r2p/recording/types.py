@@ -58,7 +58,7 @@ def type_of(info: ChannelInfo, definition: str = "") -> ChannelType | None:
 
 @functools.lru_cache(maxsize=1024)
 def _type(name: str, schema: str, definition: str) -> ChannelType | None:
-    defined = _defined(name, definition) if definition else None
+    defined = _defined(name, definition) if definition or not schema else None  # a message without fields has neither
     if defined is not None and layout(defined).schema == schema:
         return ChannelType(defined, defined)
     if defined is not None and layout(defined).schema != schema.replace(":char[", ":u8["):

@@ -4,6 +4,7 @@ Fields have the types of Apache Arrow: nested messages are structs, arrays are l
 `tables.CONTEXT` are timestamps in UTC. The type of the messages is in the metadata of the file.
 """
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,12 +28,12 @@ from r2p.recording.convert.tables import (
     tables,
 )
 from r2p.recording.format import ChannelInfo
-from r2p.recording.types import class_of
+from r2p.recording.types import schema_of, type_of
 
 _SUFFIX = ".parquet"
 _ROWS = 8192  # of a group, which are held in memory
 _READ_ROWS = 1024
-_TYPE, _SCHEMA = b"r2p.type", b"r2p.schema"
+_TYPE, _SCHEMA, _DEFINITION = b"r2p.type", b"r2p.schema", b"r2p.definition"
 _TIME = pa.timestamp("ns", tz="UTC")
 _CONTEXT = [(name, _TIME if name in TIMES else pa.uint64() if name == SEQUENCE else pa.string()) for name in CONTEXT]
 _SCALARS = {
@@ -71,8 +72,10 @@ def _rows(file: Any) -> Iterator[dict[str, Any]]:
 
 
 def _class(topic: str, metadata: Mapping[bytes, bytes]) -> type[Message] | None:
-    name, schema = (metadata.get(each, b"").decode("utf-8", "replace") for each in (_TYPE, _SCHEMA))
-    return class_of(ChannelInfo(topic, type=name, schema=schema))
+    parts = (metadata.get(each, b"").decode("utf-8", "replace") for each in (_TYPE, _SCHEMA, _DEFINITION))
+    name, schema, definition = parts
+    found = type_of(ChannelInfo(topic, type=name, schema=schema), definition)
+    return None if found is None else found.cls
 
 
 def _packer(
@@ -128,8 +131,7 @@ class _ArrowTable:
         shape = None if cls is None else layout(cls)
         self._fields = [] if shape is None else [each for each in shape.fields if _has_columns(each.shape)]
         own = [(DATA, pa.binary())] if cls is None else [(each.wire_name, _type(each.shape)) for each in self._fields]
-        metadata = {} if shape is None else {_TYPE: shape.name.encode(), _SCHEMA: shape.schema.encode()}
-        self._schema = pa.schema([*_CONTEXT, *own], metadata=metadata)
+        self._schema = pa.schema([*_CONTEXT, *own], metadata=_metadata(cls))
         self.writer = pq.ParquetWriter(path, self._schema)
         self._cls = cls
         self._columns: list[list[Any]] = [[] for _ in self._schema]
@@ -157,6 +159,16 @@ class _ArrowTable:
         arrays = [pa.array(column, each.type) for column, each in zip(self._columns, self._schema, strict=True)]
         self.writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
         self._columns = [[] for _ in self._schema]
+
+
+def _metadata(cls: type[Message] | None) -> dict[bytes, bytes]:
+    if cls is None:
+        return {}
+    shape = layout(cls)
+    values = {_TYPE: shape.name.encode(), _SCHEMA: shape.schema.encode()}
+    with contextlib.suppress(MessageError):  # ROS 2 can't define it: the schema is enough
+        values[_DEFINITION] = schema_of(cls).text.encode()
+    return values
 
 
 def _has_columns(shape: Shape) -> bool:
