@@ -9,5 +9,5 @@ format is a module with two functions, `read` and `open_sink`, and is imported w
     csv_tables  CSV, a table for each topic
     parquet     Parquet, a table for each topic, in the types of Apache Arrow
 
-`transforms` gives topics types, and makes ROS's standard types of r2p's.
+`retyping` gives topics types, and makes ROS's standard types of r2p's.
 """

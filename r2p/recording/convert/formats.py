@@ -16,8 +16,8 @@ import msgspec
 from r2p.errors import BagError
 from r2p.recording.bag import Bag
 from r2p.recording.bag_file import Attachment
+from r2p.recording.convert.retyping import Retyping
 from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
-from r2p.recording.convert.transforms import Transform
 
 _METADATA = "metadata.yaml"
 _PARTIAL = ".partial-"
@@ -100,7 +100,7 @@ def convert(
     read, write = source_format(source), target_format(target, to)
     _check_target(source, target, write, overwrite=overwrite)
     losses, messages = Losses(), dict[str, int]()
-    transform = Transform(options, write.version, losses)
+    retype = Retyping(options, write.version, losses)
     with _replacing(target) as path:
         records = read.load().read(source, options, losses)
         with write.load().open_sink(path, options, losses) as sink:
@@ -110,7 +110,7 @@ def convert(
                 if isinstance(each, Attachment):
                     sink.attach(each)
                     continue
-                for record in transform(each):
+                for record in retype(each):
                     if sink.put(record):
                         messages[record.topic] = messages.get(record.topic, 0) + 1
             if not messages:

@@ -15,7 +15,7 @@ from r2p.ros.stamps import StampSource
 _Change: TypeAlias = Callable[[ConvertedRecord], Iterable[ConvertedRecord]]
 
 
-class Transform:
+class Retyping:
     """Gives messages the types that the options ask for; `version` is the ROS whose standard types `ros` means."""
 
     def __init__(self, options: ConversionOptions, version: int, losses: Losses) -> None:
