@@ -78,11 +78,11 @@ async def test_the_slots_show_their_owner_also_one_that_died() -> None:
         assert await listener.cycles(20, timeout=1.0)
         owned = [slot for slot in listener.slots if "encoder" in slot.owners]
         assert [(slot.reserved, slot.missed) for slot in owned] == [(20, 0)]
-        cells = slots.cells_of(listener)
+        cells = slots.cells_of(listener.slots)
         assert [cell.owner for cell in cells].count("encoder") == 1
         assert cells[0].owner == "sync"
         assert [cell.owner for cell in cells].count("reserved but not used: no subscriber, or the owner is gone") == 1
-        assert [row["used"] for row in slots.rows(listener) if row["owner"] == "encoder"] == [20]
+        assert [row["used"] for row in slots.rows(listener.slots) if row["owner"] == "encoder"] == [20]
         bus.power_off()
         assert not await listener.cycles(20, timeout=1.0)
 

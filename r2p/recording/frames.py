@@ -41,6 +41,7 @@ _KINDS = tuple(bytes((kind >> 1 & 1, kind >> 2, kind & 1)) for kind in range(8))
 """The three flags of a frame, each a byte of can_msgs/Frame, by the highest three bits of its identifier."""
 
 _KIND_SHIFT = 29
+_STANDARD_MASK = 0x7FF
 _LENGTH_MAX = 15  # in the length field of a frame; only remote frames have more than 8 there
 _TIME = struct.Struct("<iII")
 _REST = struct.Struct("<I???B8s")
@@ -239,8 +240,11 @@ def frame_of(data: bytes, bus: str, *, sent: bool = False) -> RecordedFrame:
         identifier, remote, extended, error, size, content = _REST.unpack_from(data, at + -length % 4)
     except struct.error as problem:
         raise DecodeError(f"not a can_msgs/Frame: {problem}") from None
-    if not data.startswith(CDR_HEADER[:2]) or identifier > IDENTIFIER_MASK or size > _LENGTH_MAX:
+    longest = _LENGTH_MAX if remote else FRAME_MAX
+    if not data.startswith(CDR_HEADER[:2]) or identifier > IDENTIFIER_MASK or size > longest:
         raise DecodeError(f"not a can_msgs/Frame of CAN 2.0: identifier {identifier:#x}, {size} bytes")
+    if not (extended or error) and identifier > _STANDARD_MASK:
+        raise DecodeError(f"an identifier of 11 bits is not {identifier:#x}")
     time = seconds * SECOND + rest
     kept = b"" if remote else content[:size]
     return RecordedFrame(time, bus, identifier, kept, extended, size if remote else None, error, sent)

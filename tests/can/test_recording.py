@@ -10,10 +10,13 @@ import pytest
 from mcap.reader import make_reader
 
 from r2p.clock import clock_of
+from r2p.errors import TransportError
+from r2p.recording.bag import Bag
 from r2p.recording.disk import Disk, RecordingOptions
+from r2p.recording.frame_player import FramePlayer
 from r2p.recording.frame_recorder import FrameRecorder
-from r2p.recording.frames import frame_of
-from tests.can.rig import cangen, cansend, ip, until
+from r2p.recording.frames import BusInfo, FrameEntry, frame_of
+from tests.can.rig import Candump, cangen, cansend, ip, until
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -75,3 +78,38 @@ async def test_an_interface_that_goes_down_is_recorded_again(vcan: str) -> None:
             while recorder.frames < 2:
                 await (await asyncio.create_subprocess_exec("cansend", vcan, "002#")).wait()
                 await asyncio.sleep(0.01)
+
+
+async def test_a_recording_is_played_onto_the_interface(vcan: str, tmp_path: Path) -> None:
+    path = tmp_path / "bus.mcap"
+    disk = Disk(path, RecordingOptions(), clock_of(), lambda _text: None)
+    texts = ["123#0102", "7FF#R3", "1ABCDE00#R8", "00000123#BB"]
+    async with FrameRecorder(f"rtcan:{vcan}", disk.put) as recorder:
+        for text in texts:
+            cansend(vcan, text)
+        await until(lambda: recorder.frames == len(texts))
+    await disk.close()
+    with Bag(path) as bag:
+        async with Candump(vcan) as candump, FramePlayer(bag, f"rtcan:{vcan}", anyway=True) as player:
+            await player.run()
+            played = [await candump.line() for _ in texts]
+    assert played == [
+        f"{vcan} 123 [2] 01 02",
+        f"{vcan} 7FF [3] remote request",
+        f"{vcan} 1ABCDE00 [8] remote request",
+        f"{vcan} 00000123 [1] BB",
+    ]
+    assert player.sent == 4
+
+
+async def test_an_interface_that_can_not_be_played_onto_is_named(vcan: str, tmp_path: Path) -> None:
+    path = tmp_path / "bus.mcap"
+    disk = Disk(path, RecordingOptions(), clock_of(), lambda _text: None)
+    disk.put([FrameEntry(BusInfo("can0"), [(0x123, b"", 0, 0)])])
+    await disk.close()
+    with Bag(path) as bag:
+        with pytest.raises(TransportError, match="no CAN interface has this name"):
+            await FramePlayer(bag, "rtcan:nocan0").__aenter__()
+        ip("set", vcan, "down")
+        with pytest.raises(TransportError, match=f"{vcan}: .*ip link set"):
+            await FramePlayer(bag, f"rtcan:{vcan}", anyway=True).__aenter__()

@@ -70,12 +70,17 @@ async def schedule(
             f"no sync frames for {_SYNC_TIMEOUT:g} s: no RTCAN master on this bus, so it has no slots "
             "(the firmware of 2014 has none)"
         )
-    cells = cells_of(bus)
-    title = f"{_describe(bus.timing)}, over {bus.slot_cycles} cycles"
+    await show(bus.slots, bus.timing, bus.slot_cycles, output, svg)
+
+
+async def show(slots: list[BusSlot], timing: Timing, cycles: int, output: Output, svg: Path | None) -> None:
+    """Print the use of the slots over so many cycles, and draw it into a file if there is one."""
+    cells = cells_of(slots)
+    title = f"{_describe(timing)}, over {cycles} cycles"
     if output.format == "text":
         await output.remark("\n".join([title, "", *drawing(cells)]))
     else:
-        await output.table(rows(bus), ["slot", "owner", "reserved", "used", "missed", "shared"])
+        await output.table(rows(slots), ["slot", "owner", "reserved", "used", "missed", "shared"])
     if svg is not None:
         save(svg, cells, title)
 
@@ -84,7 +89,7 @@ def _describe(grid: Timing) -> str:
     return f"{grid.slots} slots of {grid.slot / 1000:g} us"
 
 
-def cells_of(bus: BusMonitor) -> list[Cell]:
+def cells_of(slots: list[BusSlot]) -> list[Cell]:
     """Return the slots of a bus for a drawing."""
     return [
         Cell(
@@ -93,11 +98,11 @@ def cells_of(bus: BusMonitor) -> list[Cell]:
             slot.shared,
             f"{', '.join(slot.owners) or 'free'}: {slot.used} of {slot.reserved} used, {slot.shared} events",
         )
-        for slot in bus.slots
+        for slot in slots
     ]
 
 
-def rows(bus: BusMonitor) -> list[dict[str, object]]:
+def rows(slots: list[BusSlot]) -> list[dict[str, object]]:
     """Return the slots of a bus as records; the numbers count cycles."""
     return [
         {
@@ -108,7 +113,7 @@ def rows(bus: BusMonitor) -> list[dict[str, object]]:
             "missed": slot.missed,
             "shared": slot.shared,
         }
-        for index, slot in enumerate(bus.slots)
+        for index, slot in enumerate(slots)
     ]
 
 

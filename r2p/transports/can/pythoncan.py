@@ -57,7 +57,7 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
     def __init__(self, interface: str, channel: str, bitrate: int) -> None:
         """Raises TransportError if python-can is not installed, or does not know the interface."""
         super().__init__(f"{interface}:{channel}")
-        self._can = _library()
+        self._can = library()
         if interface not in self._can.VALID_INTERFACES:
             known = ", ".join(sorted(self._can.VALID_INTERFACES))
             raise TransportError(f"rtcan:{self.name}: python-can has no interface {interface!r}; it knows: {known}")
@@ -292,7 +292,8 @@ def _stamp(message: "can.Message", read_at: int) -> int:
     return stamp if 0 <= read_at - stamp < _STAMP_AGE_MAX_S * SECOND else read_at
 
 
-def _library() -> Any:
+def library() -> Any:
+    """Return python-can, which is loaded only where it is used. Raises TransportError if it is not installed."""
     try:
         library = importlib.import_module("can")
     except ImportError as error:
