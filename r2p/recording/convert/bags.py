@@ -37,7 +37,7 @@ def read_files(paths: list[Path], options: ConversionOptions, losses: Losses) ->
         for topic, count in bag.undecodable.items():
             losses[f"messages of {topic} that can't be decoded"] += count
         if bag.damaged:
-            losses["damaged parts of the file, with all messages in them"] += bag.damaged
+            losses["chunks of the file that can't be read, with all messages in them"] += bag.damaged
 
 
 def _samples(bag: Bag, options: ConversionOptions) -> Iterator[ConvertedRecord]:
@@ -85,7 +85,7 @@ def _channel(channel: BagChannel) -> _ReadChannel | str:
     """Return how to read a channel, or in words what is lost of it."""
     version = _VERSIONS.get((channel.encoding, channel.schema_encoding))
     if version is None:
-        return f"messages of {channel.name}, which are {channel.encoding or 'of no encoding'}, not cdr or ros1"
+        return f"messages of {channel.name}, encoded as {channel.encoding or 'nothing'}, not as cdr or ros1"
     try:
         topic = topic_name(channel.name)
         decoder = ros_decoder(channel.schema_name, version, channel.schema.decode("utf-8", "replace"))

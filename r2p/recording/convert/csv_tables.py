@@ -120,6 +120,6 @@ class _WrittenTable:
         try:
             values = [data.hex()] if self._cls is None else flatten(to_plain(self._cls.decode(data), "cells")).values()
         except DecodeError:
-            return f"messages of {record.topic} that are not of type {record.type_name}"
+            return f"messages of {record.topic} of another type than {record.type_name}"
         self._rows.writerow([*context_of(record), *values])
         return ""

@@ -114,12 +114,27 @@ def convert(
                     if sink.put(record):
                         messages[record.topic] = messages.get(record.topic, 0) + 1
             if not messages:
-                raise BagError(f"{source} has no message to convert{_why(losses)}")
+                raise BagError(f"there is nothing to write into {target}: {_why(source, options, losses)}")
     return ConversionResult(read.name, write.name, messages, losses)
 
 
-def _why(losses: Losses) -> str:
-    return ": there are " + "; ".join(f"{count} {what}" for what, count in losses.items()) if losses else ""
+def _why(source: Path, options: ConversionOptions, losses: Losses) -> str:
+    """Return why no message was written."""
+    found = lost_in_words(losses)
+    if found:
+        return f"{source} has {'; '.join(found)}"
+    wanted = f" of {', '.join(options.topics)}" if options.topics else ""
+    then = " at that time" if options.start is not None or options.end is not None else ""
+    return f"{source} has no messages{wanted}{then}"
+
+
+def lost_in_words(losses: Losses) -> list[str]:
+    """Return a line for each kind of loss: 1 deadline, 5 stamps of publishers."""
+    lines = []
+    for what, count in losses.items():
+        kind, space, rest = what.partition(" ")
+        lines.append(f"{count} {kind.removesuffix('s') if count == 1 else kind}{space}{rest}")
+    return lines
 
 
 def extent(path: Path) -> tuple[int, int]:
@@ -141,13 +156,16 @@ def writable_formats() -> list[str]:
 def source_format(path: Path) -> Format:
     """Return the format of a recording. Raises BagError."""
     if not path.is_dir():
-        return _of_suffix(path)
+        found = _of_suffix(path)
+        if found.name != "mcap" and not path.exists():  # a recording of ours may have parts with other names
+            raise BagError(f"there is no file {path}")
+        return found
     if (path / _METADATA).exists():
         return FORMATS["rosbag2"]
-    found = next((each for each in FORMATS.values() if each.is_file and any(path.rglob(f"*{each.suffixes[0]}"))), None)
-    if found is None:
-        raise BagError(f"{path} is not a recording: it has no {_METADATA}, and no files of {_suffixes()}")
-    return found
+    for each in FORMATS.values():
+        if each.is_file and any(path.rglob(f"*{each.suffixes[0]}")):
+            return each
+    raise BagError(f"{path} is not a recording: it has no {_METADATA}, and no files of {_suffixes()}")
 
 
 def target_format(path: Path, to: str | None = None) -> Format:

@@ -144,7 +144,7 @@ class _ArrowTable:
         try:
             message = None if self._cls is None else self._cls.decode(data)
         except DecodeError:
-            return f"messages of {record.topic} that are not of type {record.type_name}"
+            return f"messages of {record.topic} of another type than {record.type_name}"
         values = (
             [data] if message is None else [_value(each.shape, getattr(message, each.name)) for each in self._fields]
         )

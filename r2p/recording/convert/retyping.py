@@ -45,7 +45,7 @@ class Retyping:
     def _typed(self, topic: str, cls: type[Message]) -> _Change:
         """Return what gives messages of unknown type a class."""
         decode = layout(cls).decode
-        problem = f"messages of {topic} that are not of type {layout(cls).name}, kept as bytes"
+        problem = f"messages of {topic} of another type than {layout(cls).name}, kept as bytes"
 
         def change(record: ConvertedRecord) -> Iterable[ConvertedRecord]:
             try:

@@ -63,12 +63,14 @@ def open_sink(path: Path, options: ConversionOptions, losses: Losses) -> "Rosbag
 
 
 class Rosbag1Sink(RecordSink):
-    """Writes a `.bag` file, with a connection for each topic, type and publisher."""
+    """Writes a `.bag` file, with a connection for each topic, type and publisher.
+
+    It is not compressed: of what rosbags compresses, ROS 1 reads bz2 only, which is slow (`rosbag compress` does that).
+    """
 
     def __init__(self, path: Path, losses: Losses) -> None:
         super().__init__(losses)
         self._writer = Writer(path)
-        self._writer.set_compression(Writer.CompressionFormat.LZ4)
         self._writer.open()
         self._connections: dict[object, Any] = {}
 

@@ -117,7 +117,7 @@ class Rosbag2Sink(RecordSink):
         if problem is None:
             problem = self._problems[key] = self._problem(record)
         if not problem and not _is_of(record.cls, record.sample):
-            problem = f"messages of {record.topic} that are not of type {record.type_name}"
+            problem = f"messages of {record.topic} of another type than {record.type_name}"
         return self.lose(problem) if problem else self._bag.put(record)
 
     def attach(self, attachment: Attachment) -> None:

@@ -74,7 +74,7 @@ async def convert(
         result = await _in_thread(run)
     except OSError as error:
         raise UsageError(f"{error.filename or target}: {error.strerror}") from error
-    await output.put(_record(source, target, result), _text(target, result))
+    await output.put(_record(source, target, result), _text(target, result, formats.lost_in_words(result.losses)))
 
 
 def _of_settings(types: Types) -> "dict[str, type[r2p.Message]]":
@@ -103,13 +103,7 @@ def _record(source: Path, target: Path, result: "ConversionResult") -> dict[str,
     }
 
 
-def _text(target: Path, result: "ConversionResult") -> str:
+def _text(target: Path, result: "ConversionResult", lost: list[str]) -> str:
     count, topics = sum(result.messages.values()), len(result.messages)
-    lines = [f"{target}: {count} message{'s' * (count != 1)} of {topics} topic{'s' * (topics != 1)}"]
-    if result.losses:
-        lines += [f"{result.target_format} has no place for:", *_lines(result)]
-    return "\n".join(lines)
-
-
-def _lines(result: "ConversionResult") -> list[str]:
-    return [f"  {count} {what}" for what, count in result.losses.items()]
+    text = f"{target}: {count} message{'s' * (count != 1)} of {topics} topic{'s' * (topics != 1)}"
+    return "\n".join([text, *(["lost:"] if lost else []), *(f"  {each}" for each in lost)])

@@ -130,7 +130,7 @@ def test_mcap_files_of_other_programs(tmp_path: Path) -> None:
     result = convert(tmp_path / "theirs.mcap", tmp_path / "ours.mcap")
     assert result.messages == {"one": 1, "two": 1}
     assert [each.split(":")[0] for each in sorted(result.losses)] == [
-        "messages of /json, which are json, not cdr or ros1",
+        "messages of /json, encoded as json, not as cdr or ros1",
         "messages of /no topic",
         "messages of short that can't be decoded",
     ]
@@ -196,7 +196,7 @@ def test_standard_types_of_ros(name: str, tmp_path: Path) -> None:
 def test_messages_of_unknown_type_get_one(tmp_path: Path) -> None:
     write(tmp_path / "drive.mcap", "leds", None, Led(3, 1), Odometry())
     result = convert(tmp_path / "drive.mcap", tmp_path / "typed.mcap", ConversionOptions(types={"le*": Led}))
-    assert result.losses == {"messages of leds that are not of type r2p_msgs/Led, kept as bytes": 1}
+    assert result.losses == {"messages of leds of another type than r2p_msgs/Led, kept as bytes": 1}
     assert [each[2] for each in content(tmp_path / "typed.mcap")] == [Led, None]
 
 
