@@ -17,7 +17,7 @@ from r2p.errors import BagError
 from r2p.recording.bag import Bag
 from r2p.recording.bag_file import Attachment
 from r2p.recording.convert.retyping import Retyping
-from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
+from r2p.recording.convert.stream import ATTACHMENTS, ConversionOptions, ConvertedRecord, Losses, RecordSink
 
 _METADATA = "metadata.yaml"
 _PARTIAL = ".partial-"
@@ -120,7 +120,7 @@ def convert(
 
 def _why(source: Path, options: ConversionOptions, losses: Losses) -> str:
     """Return why no message was written."""
-    found = lost_in_words(losses)
+    found = lost_in_words(Losses({what: count for what, count in losses.items() if what != ATTACHMENTS}))
     if found:
         return f"{source} has {'; '.join(found)}"
     wanted = f" of {', '.join(options.topics)}" if options.topics else ""

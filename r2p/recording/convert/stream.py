@@ -17,6 +17,10 @@ Losses: TypeAlias = Counter[str]
 """What the result lacks, in words, and how many of them: `losses["deadlines"] += 1`."""
 
 
+ATTACHMENTS = "attachments"
+"""What is lost of a recording with attachments in most formats."""
+
+
 class ConversionOptions(msgspec.Struct, frozen=True, kw_only=True):
     """What of a recording is converted, and into which types.
 
@@ -87,7 +91,7 @@ class RecordSink(abc.ABC):
 
     def attach(self, attachment: Attachment) -> None:
         """Write an attachment; most formats have none."""
-        self.losses["attachments"] += 1
+        self.losses[ATTACHMENTS] += 1
 
     @abc.abstractmethod
     def finish(self) -> None:

@@ -14,12 +14,14 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 import r2p
+from r2p.codecs.can_bits import LOCAL, WireFrame
 from r2p.messages import Message, layout
 from r2p.msg import Led, Odometry, Pose3, Velocity3
 from r2p.recording.bag import Bag
 from r2p.recording.convert.formats import convert, target_format
 from r2p.recording.convert.stream import ConversionOptions
 from r2p.recording.format import META_PREFIX
+from r2p.recording.frames import BusInfo, FrameEntry, FrameWriter
 from r2p.recording.samples import SampleWriter
 from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import cdr
@@ -81,6 +83,33 @@ def test_ros1_keeps_the_bytes_and_the_times(recording: Path, tmp_path: Path) -> 
         for topic, time, cls, sample in content(recording)
         if cls is not None
     ]
+
+
+def test_frames_and_events_keep_their_channels(tmp_path: Path) -> None:
+    with (tmp_path / "drive.mcap").open("wb") as file:
+        writer = BagWriter(file)
+        frames: list[WireFrame] = [(0x123, b"abc", 0, START), (0x124, b"d", LOCAL, START + 5)]
+        FrameWriter(writer).write(FrameEntry(BusInfo("can0"), frames))
+        writer.finish()
+    convert(tmp_path / "drive.mcap", tmp_path / "drive")
+    assert all_records(tmp_path / "drive") == all_records(tmp_path / "drive.mcap")
+    assert len(all_records(tmp_path / "drive")) == 2
+    result = convert(tmp_path / "drive", tmp_path / "frames.csv")
+    assert result.messages == {"can0/frames": 2}
+    assert (
+        (tmp_path / "frames.csv")
+        .read_text()
+        .splitlines()[1]
+        .endswith(",can0,291,False,False,False,3,97,98,99,0,0,0,0,0")
+    )
+
+
+def all_records(path: Path) -> list[Any]:
+    with Bag(path) as bag:
+        return [
+            (each.channel.name, each.channel.metadata, each.log_time, each.publish_time, each.sequence, each.data)
+            for each in bag.raw()
+        ]
 
 
 # Read by others
