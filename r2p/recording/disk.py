@@ -50,7 +50,7 @@ class Disk:
         self._virtual = clock.virtual
         self._limit = options.queue_bytes
         self._dropped: Counter[str] = Counter()
-        self._dropping = False
+        self._dropping = self._closed = False
         self._put_bytes = self._done_bytes = 0  # each is written by one thread only
         self._jobs: queue.SimpleQueue[tuple[list[Entry], int] | Callable[[], bool]] = queue.SimpleQueue()
         self._files = RecordingFiles(Path(path), options, clock, self._notify, opened)
@@ -75,7 +75,9 @@ class Disk:
     @property
     def lost(self) -> dict[str, int]:
         """The messages by topic that were handed over and are in no file."""
-        return dict(self._dropped + self._files.lost)
+        lost = Counter(self._dropped)
+        lost.update(dict(self._files.lost))  # a copy: the thread counts while this iterates
+        return dict(lost)
 
     @property
     def queued_bytes(self) -> int:
@@ -83,11 +85,19 @@ class Disk:
         return self._put_bytes - self._done_bytes
 
     def put(self, entries: list[Entry]) -> None:
-        """Hand entries over, in a list that is not used any more. Never waits: drops what does not fit the queue."""
+        """Hand entries over, in a list that is not used any more. Never waits: drops what does not fit the queue.
+
+        Does nothing after `close`.
+        """
+        if self._closed:
+            return
         if self._virtual:
             self._write(entries)
             return
         size = sum([entry.nbytes for entry in entries])
+        if self._dropping and self.queued_bytes < self._limit // 2:
+            self._dropping = False
+            self._report(f"the disk keeps up again; {self._dropped.total()} messages were dropped so far")
         if self.queued_bytes + size > self._limit:
             entries, size = self._fitting(entries)
         self._put_bytes += size
@@ -114,7 +124,9 @@ class Disk:
 
     async def close(self) -> None:
         """Write what waits, and end the file."""
-        await self._call(self._files.finish, last=True)
+        if not self._closed:
+            self._closed = True
+            await self._call(self._files.finish, last=True)
 
     async def _call(self, function: Callable[[], R], *, last: bool = False) -> R:
         """Call a function in the thread, after all that was put before."""
@@ -152,14 +164,11 @@ class Disk:
 
     def _write(self, entries: list[Entry]) -> None:
         try:
-            if self.stopped:
-                for entry in entries:
-                    self._files.lost[entry.lost_as] += entry.count
-                return
             self._files.write(entries)
             self._files.tick()
-        except Exception:
+        except Exception as error:
             logger.exception("internal error in the thread that writes the recording")
+            self._files.fail(f"internal error: {error!r}")
 
     def _notify(self, text: str) -> None:
         if self._virtual:

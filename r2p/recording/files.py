@@ -14,6 +14,7 @@ from r2p.clock import Clock
 from r2p.errors import Error
 from r2p.log_lines import get_logger
 from r2p.recording.entries import Entry, EntryWriter
+from r2p.recording.format import META_PREFIX
 from r2p.recording.mcap_file import McapFile, PackedChunk
 from r2p.recording.writer import BagWriter
 from r2p.units import MILLISECOND, SECOND
@@ -23,6 +24,7 @@ logger = get_logger("r2p.recording")
 _CHUNK_EVERY: Final = 500 * MILLISECOND  # ns after which messages go to the operating system, full chunk or not
 _SYNC_EVERY: Final = SECOND  # ns after which they have to be on the disk
 _FULL: Final = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EFBIG))
+_RING_MAX: Final = 1 << 30  # bytes in memory for a snapshot, unless max_size says otherwise
 _FILES_OF_TOTAL: Final = 10  # files that share max_total, where nothing else says when a file ends
 
 
@@ -31,8 +33,9 @@ class RecordingOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     The recording ends at `max_size` or `max_duration`; with `split`, another file begins there. `max_total` is for all
     files: the oldest are deleted, and so they are when the disk is full. With less than `min_free` on the disk the
-    recording ends. With `snapshot`, that many seconds are kept in memory, and written when asked for. `queue_bytes` is
-    the memory for what waits for a slow disk. Raises ValueError for options that don't go together.
+    recording ends. With `snapshot`, that many seconds are kept in memory, of which they may take `max_size`, and
+    written when asked for. `queue_bytes` is the memory for what waits for a slow disk. Raises ValueError for options
+    that don't go together.
     """
 
     max_size: int = 0
@@ -48,8 +51,8 @@ class RecordingOptions(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError("max_total deletes the oldest files of a recording: it needs split")
         if self.split and not (self.max_size or self.max_duration or self.max_total):
             raise ValueError("split needs a max_size or max_duration for each file, or a max_total for all")
-        if self.snapshot and (self.split or self.max_size or self.max_duration):
-            raise ValueError("snapshot writes a file when asked for: max_size, max_duration and split don't apply")
+        if self.snapshot and (self.split or self.max_duration):
+            raise ValueError("snapshot writes a file when asked for: max_duration and split don't go with it")
 
     @property
     def file_size(self) -> int:
@@ -93,9 +96,10 @@ class RecordingFiles:
         self._number = 0
         self._sizes: dict[Path, int] = {}  # of finished files
         self._ring: deque[PackedChunk] = deque()
-        self._faults = 0
-        self._chunk_due = self._sync_due = 0
+        self._ring_size = 0
+        self._failed = False
         self._began = clock.monotonic()
+        self._chunk_due, self._sync_due = self._began + _CHUNK_EVERY, self._began + _SYNC_EVERY
         self._raw: BinaryIO | None = None
         self._file: McapFile | None = None
         if (free := self._free()) < options.min_free:
@@ -112,19 +116,25 @@ class RecordingFiles:
 
     def write(self, entries: Iterable[Entry]) -> None:
         """Write entries into chunks, and full chunks into the file."""
+        if self.stopped:
+            self._refuse(entries)
+            return
         for entry in entries:
             try:
                 entry.write(self.entries)
             except Exception as error:  # noqa: BLE001 - one bad entry costs no other
-                self._refuse(entry, error)
+                self._refuse([entry], error)
         self._write_out()
 
-    def _refuse(self, entry: Entry, error: Exception) -> None:
-        self.lost[entry.lost_as] += entry.count
-        self._faults += 1
-        if self._faults == 1:
-            logger.exception("internal error: a message of %s is not recorded", entry.lost_as, exc_info=error)
-            self._report(f"a message of {entry.lost_as} is not recorded: {error}; others are counted")
+    def _refuse(self, entries: Iterable[Entry], error: Exception | None = None) -> None:
+        """Count entries that are not recorded; not those behind a limit that the user set."""
+        if self.stopped and not self._failed:
+            return
+        for entry in entries:
+            if error is not None and entry.lost_as not in self.lost:
+                self._report(f"a message of {entry.lost_as} can't be recorded: {error}; more of them are only counted")
+                logger.debug("a message of %s can't be recorded", entry.lost_as, exc_info=error)
+            self.lost[entry.lost_as] += entry.count
 
     def tick(self) -> None:
         """End the chunk every half second, and see to it that it is on the disk every second. Call it often."""
@@ -140,22 +150,21 @@ class RecordingFiles:
         if limit and not self.stopped and now - self._began >= limit * SECOND:
             self.writer.end_chunk()
             self._write_out()
-            self._limit_reached("max_duration")
+            self._limit_reached(f"max_duration ({limit:g} s)")
 
     def _sync(self) -> None:
         if self._raw is None:
             return
         try:
-            if not self._clock.virtual:
-                os.fdatasync(self._raw.fileno())
+            self._sync_file(self._raw)
             self._check_free()
         except OSError as error:
-            self._fail(error)
+            self._on_error(error)
 
     def _check_free(self) -> None:
         while self._options.min_free and self._free() < self._options.min_free:
             if not self._delete_oldest():
-                self._stop(f"less than {_mb(self._options.min_free)} are free on the disk (min_free)")
+                self.fail(f"less than {_mb(self._options.min_free)} are free on the disk (min_free)")
                 return
 
     # Out to the disk
@@ -168,12 +177,12 @@ class RecordingFiles:
         while ready and self._file is not None:
             item = ready[0]
             if isinstance(item, PackedChunk) and self._over(item):
-                self._limit_reached("max_size")
+                self._limit_reached(f"max_size ({_mb(self._options.file_size)})")
                 continue
             try:
                 self._file.write(item)
             except OSError as error:
-                self._fail(error)
+                self._on_error(error)
                 continue
             ready.popleft()
         self._check_total()
@@ -184,36 +193,48 @@ class RecordingFiles:
         return bool(limit) and file.has_messages and file.size + file.summary_size + 2 * chunk.size > limit
 
     def _limit_reached(self, limit: str) -> None:
-        if self._options.split:
+        if self._options.split and not self.stopped:
             self._next_file()
-        else:
+        elif not self.stopped:
+            self.stopped = f"{limit} is reached"
             self.writer.ready.clear()
-            self._stop(f"{limit} is reached")
+            self._finish_file()
+            self._report(f"the recording ended: {self.stopped}")
 
     def _next_file(self) -> None:
         """Finish this file, and go on in another one, which begins with the channels, metadata and attachments."""
         self._finish_file()
-        try:
-            self._open()
-        except OSError as error:
-            self._fail(error)
+        while self._file is None and not self.stopped:
+            try:
+                self._open()
+            except OSError as error:
+                self._on_error(error)
 
     def _open(self) -> None:
-        while True:
-            path = self._next_path()
-            try:
-                raw = self._opened(path)
-                break
-            except FileExistsError:
-                if not self._numbered or not self._number > 1:
-                    raise
+        """Create the next file. Raises OSError; then there is none."""
+        path, raw = self._create()
+        try:
+            file = McapFile(raw)
+        except OSError:
+            raw.close()
+            path.unlink()
+            raise
         _sync_directory(path.parent)
         self.paths.append(path)
         self._began = self._clock.monotonic()
-        self._raw, self._file = raw, McapFile(raw)
+        self._raw, self._file = raw, file
         waiting = [item for item in self.writer.ready if isinstance(item, PackedChunk)]
         self.writer.ready.clear()
         self.writer.ready.extend((*self.writer.registered, *waiting))
+
+    def _create(self) -> tuple[Path, BinaryIO]:
+        while True:
+            path = self._next_path()
+            try:
+                return path, self._opened(path)
+            except FileExistsError:
+                if not self._numbered or self._number == 1:  # later ones take the next number that is free
+                    raise
 
     @property
     def _numbered(self) -> bool:
@@ -231,15 +252,21 @@ class RecordingFiles:
             return
         try:
             self._finish_with_room(file)
-            if not self._clock.virtual:
-                os.fsync(raw.fileno())
+            self._sync_file(raw)
         except OSError as error:
             self._report(f"{self.paths[-1]} has no end ({error.strerror}): `r2p bag recover` makes it whole")
         finally:
-            with contextlib.suppress(OSError):
-                raw.close()
-            self.finished_bytes += file.size
-            self._sizes[self.paths[-1]] = file.size
+            self._close(raw, file)
+
+    def _sync_file(self, raw: BinaryIO) -> None:
+        if not self._clock.virtual:
+            os.fdatasync(raw.fileno())
+
+    def _close(self, raw: BinaryIO, file: McapFile) -> None:
+        with contextlib.suppress(OSError):
+            raw.close()
+        self.finished_bytes += file.size
+        self._sizes[self.paths[-1]] = file.size
 
     def _finish_with_room(self, file: McapFile) -> None:
         while True:
@@ -249,16 +276,20 @@ class RecordingFiles:
             except OSError as error:
                 if error.errno not in _FULL or not file.has_messages:
                     raise
-            self._count_lost(file.drop_last_chunk())
+            if self._delete_oldest():
+                continue
+            lost = file.drop_last_chunk()
+            self._count_lost(lost)
+            self._report(f"the disk is full: the last {sum(lost.values())} messages made room for the end of the file")
 
     # What goes wrong
 
-    def _fail(self, error: OSError) -> None:
-        """Make room on a full disk, or end the recording."""
-        if error.errno in _FULL and self._delete_oldest():
-            return
-        full = "the disk is full" if error.errno in _FULL else f"the disk failed: {error.strerror}"
-        self._stop(full)
+    def _on_error(self, error: OSError) -> None:
+        """Make room, or go on in another file; otherwise the recording ends."""
+        if error.errno == errno.EFBIG and self._options.split and self._file is not None and self._file.has_messages:
+            self._next_file()
+        elif error.errno not in _FULL or not self._delete_oldest():
+            self.fail(_reason(error))
 
     def _delete_oldest(self) -> bool:
         if not self._options.max_total or len(self.paths) < 2:
@@ -274,9 +305,9 @@ class RecordingFiles:
         while limit and self._file and sum(self._sizes.values()) + self._file.size > limit and self._delete_oldest():
             pass
 
-    def _stop(self, why: str) -> None:
-        """End the recording with a file that can be read."""
-        self.stopped = why
+    def fail(self, why: str) -> None:
+        """End the recording with a file that can be read, as nothing more can be written."""
+        self.stopped, self._failed = why, True
         before = self.lost.total()
         self.writer.end_chunk()
         for item in self.writer.ready:
@@ -285,12 +316,13 @@ class RecordingFiles:
         self.writer.ready.clear()
         self._finish_file()
         lost = self.lost.total() - before
-        self._report(f"recording ended: {why}" + (f"; the last {lost} messages are lost" if lost else ""))
+        self._report(f"the recording ended: {why}" + (f"; its last {lost} messages are lost" if lost else ""))
 
     def _count_lost(self, counts: Mapping[int, int]) -> None:
         for channel, count in counts.items():
             about = self.writer.channels[channel]
-            self.lost[about.metadata.get("topic", about.topic)] += count
+            if not about.topic.startswith(META_PREFIX):
+                self.lost[about.metadata.get("topic", about.topic)] += count
 
     def _free(self) -> int:
         found = os.statvfs(self.path.parent)
@@ -300,12 +332,15 @@ class RecordingFiles:
 
     def _keep(self) -> None:
         """Keep the chunks of the last seconds in memory."""
-        self._ring.extend(item for item in self.writer.ready if isinstance(item, PackedChunk))
+        chunks = [item for item in self.writer.ready if isinstance(item, PackedChunk)]
         self.writer.ready.clear()
+        self._ring.extend(chunks)
+        self._ring_size += sum(chunk.size for chunk in chunks)
         if self._ring:
             oldest = self._ring[-1].end - round(self._options.snapshot * SECOND)
-            while self._ring[0].end < oldest:
-                self._ring.popleft()
+            limit = self._options.max_size or _RING_MAX
+            while len(self._ring) > 1 and (self._ring[0].end < oldest or self._ring_size > limit):
+                self._ring_size -= self._ring.popleft().size
 
     def snapshot(self) -> Path:
         """Write what is in memory into a new file. Raises OSError; then there is no file."""
@@ -313,18 +348,27 @@ class RecordingFiles:
         self._keep()
         self._open()
         self.writer.ready.clear()
-        file = self._file
+        raw, file, path = self._raw, self._file, self.paths[-1]
+        self._raw = self._file = None
+        assert raw is not None
         assert file is not None
         try:
-            for record in self.writer.registered:
-                file.write(record)
-            for chunk in self._ring:
-                file.write(chunk)
+            self._fill(file)
+            self._sync_file(raw)
         except OSError:
-            self._finish_file()
+            self.paths.pop()
+            path.unlink()
+            raw.close()
             raise
-        self._finish_file()
-        return self.paths[-1]
+        self._close(raw, file)
+        return path
+
+    def _fill(self, file: McapFile) -> None:
+        for record in self.writer.registered:
+            file.write(record)
+        for chunk in self._ring:
+            file.write(chunk)
+        file.finish()
 
     def finish(self) -> None:
         """Write what is left, and end the file."""
@@ -344,4 +388,10 @@ def _sync_directory(path: Path) -> None:
 
 
 def _mb(count: int) -> str:
-    return f"{count / 1e6:.0f} MB"
+    return f"{count / 1e6:.4g} MB"
+
+
+def _reason(error: OSError) -> str:
+    if error.errno == errno.EFBIG:
+        return "the file has the largest size that its file system, or a limit of this process, allows"
+    return "the disk is full" if error.errno in _FULL else f"the disk failed: {error.strerror or error}"

@@ -186,12 +186,6 @@ class McapFile:
         self._written.append(_Written(position, crc, line[0], line, *times))
 
     @property
-    def duration(self) -> int:
-        """Ns from the first message to the last."""
-        start, end = self._times()
-        return end - start
-
-    @property
     def has_messages(self) -> bool:
         """Whether there is a chunk."""
         return bool(self._counts)

@@ -53,6 +53,7 @@ class BagWriter:
         self.channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
+        self._last_channel = 0
         self._chunk_size = chunk_size
         self._compressor = zstandard.ZstdCompressor()
         self._parts: list[bytes] = []
@@ -74,7 +75,7 @@ class BagWriter:
         Raises MessageError for more channels than a file can have.
         """
         schema_id = 0 if schema is None else self._schema(*schema)
-        channel = max(self.channels, default=0) + 1
+        channel = self._last_channel + 1
         if channel > _IDS_MAX:
             raise MessageError(f"a recording has at most {_IDS_MAX} channels: no room for {topic}")
         self._add_channel(Channel(channel, topic, encoding, dict(metadata), schema_id))
@@ -89,26 +90,27 @@ class BagWriter:
     def _add_schema(self, schema: Schema) -> None:
         self._schemas[schema.id] = schema
         self._schema_ids.setdefault((schema.name, schema.encoding, schema.data), schema.id)
-        self._register(schema)
+        self.register(schema)
 
     def _add_channel(self, channel: Channel) -> None:
         self.channels[channel.id] = channel
+        self._last_channel = max(self._last_channel, channel.id)
         self._indexes[channel.id] = []
-        self._register(channel)
+        self.register(channel)
 
     def copy_channel(self, channel: Channel, schema: Schema | None) -> None:
         """Begin a channel of another file under the id that it has there, for `copy_chunk`.
 
         Raises DecodeError if that id, or that of the schema, belongs to something else in this file.
         """
-        if schema is not None and self._schemas.setdefault(schema.id, schema) != schema:
-            raise DecodeError(f"two schemas have the id {schema.id}")
-        if self.channels.get(channel.id, channel) != channel:
-            raise DecodeError(f"two channels have the id {channel.id}")
-        if schema is not None and schema not in self.registered:
+        if schema is not None and schema.id not in self._schemas:
             self._add_schema(schema)
+        if schema is not None and self._schemas[schema.id] != schema:
+            raise DecodeError(f"two schemas have the id {schema.id}")
         if channel.id not in self.channels:
             self._add_channel(channel)
+        if self.channels[channel.id] != channel:
+            raise DecodeError(f"two channels have the id {channel.id}")
 
     def add(self, channel: int, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
         """Write a message; times in ns since 1970."""
@@ -133,13 +135,14 @@ class BagWriter:
 
     def attach(self, name: str, media_type: str, data: bytes, time: int) -> None:
         """Write an attachment, such as r2p.toml."""
-        self._register(Attachment(time, time, name, media_type, data))
+        self.register(Attachment(time, time, name, media_type, data))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        self._register(Metadata(name, dict(values)))
+        self.register(Metadata(name, dict(values)))
 
-    def _register(self, record: McapRecord) -> None:
+    def register(self, record: McapRecord) -> None:
+        """Write a record that each file of the recording has, such as an attachment of another file."""
         self.registered.append(record)
         self._append(record)
 
