@@ -141,7 +141,7 @@ class RecordFile:
             raise self._damaged(ref, "it is not what the index says")
         body = self.read(ref.offset + RECORD_HEAD.size, length)
         try:
-            return _unpacked(body)
+            return unpacked(body)
         except Exception as error:  # each library has its own errors
             raise self._damaged(ref, str(error) or "its numbers are wrong") from error
 
@@ -159,7 +159,7 @@ class RecordFile:
         return ChunkRef(start, end, offset, length + RECORD_HEAD.size, compression=compression, size=size)
 
 
-def _unpacked(body: bytes) -> bytes:
+def unpacked(body: bytes) -> bytes:
     """Return the records in the body of a chunk. Raises any exception."""
     _, _, size, crc, name = _CHUNK_HEAD.unpack_from(body)
     at = _CHUNK_HEAD.size + name
@@ -178,19 +178,49 @@ def _unpacked(body: bytes) -> bytes:
     return data
 
 
+def unpacked_to_cut(body: bytes) -> bytes:
+    """Return the records in the body of a chunk within which the file ends, as far as they go. Raises any exception.
+
+    The last one may be cut; no checksum covers them.
+    """
+    _, _, size, _, name = _CHUNK_HEAD.unpack_from(body)
+    compression = body[_CHUNK_HEAD.size : _CHUNK_HEAD.size + name].decode()
+    packed = body[_CHUNK_HEAD.size + name + _LENGTH.size :]
+    if not compression:
+        return packed
+    read = _reader(compression, packed)
+
+    def read_to_cut(count: int) -> bytes:
+        try:
+            return read(count)
+        except EOFError:  # lz4 raises it at the cut, zstd returns nothing
+            return b""
+
+    return _in_steps(read_to_cut, min(size, CHUNK_MAX))
+
+
 def _decompressed(compression: str, packed: memoryview, size: int) -> bytes:
     if not compression:
         return bytes(packed)
-    if compression == "zstd":
+    if compression == "zstd" and size <= _AT_ONCE:
         import zstandard  # only here, as of lz4: most files have one of them, and `r2p bag info` needs neither
 
-        if size <= _AT_ONCE and zstandard.frame_content_size(packed) in {-1, size}:
+        if zstandard.frame_content_size(packed) in {-1, size}:
             return zstandard.decompress(packed, max_output_size=size)
-        return _in_steps(zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True).read, size)
+    return _in_steps(_reader(compression, packed), size)
+
+
+def _reader(compression: str, packed: bytes | memoryview) -> Callable[[int], bytes]:
+    """Return a function that unpacks up to so many more bytes. Raises ValueError for an unknown compression."""
+    if compression == "zstd":
+        import zstandard
+
+        return zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True).read
     if compression == "lz4":
         import lz4.frame  # type: ignore[import-untyped]
 
-        return _in_steps(lz4.frame.LZ4FrameFile(BytesIO(packed)).read, size)
+        read: Callable[[int], bytes] = lz4.frame.LZ4FrameFile(BytesIO(packed)).read
+        return read
     raise ValueError(f"its compression, {compression[:20]!r}, is unknown")
 
 
