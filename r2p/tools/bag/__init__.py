@@ -1,13 +1,16 @@
 """`r2p bag`: recordings of topics, CAN frames and what happened to them, in files.
 
 `record` writes a file, and `convert` makes files of other formats of it, and it of those. `frames` shows the CAN frames
-in one.
+in one;
+`recover` makes a file whole that was cut off.
 """
 
 from r2p.tools import session
 from r2p.tools.bag import convert, frames, record
+from r2p.tools.bag.recover import recover
 
 app = session.group("Record topics to a file, and play, inspect and convert it.")
 session.command(app, "record", endless=lambda _given: True, check=record.check)(record.record)
 app.command("frames")(session.standalone(frames.frames))
 app.command("convert")(session.standalone(convert.convert))
+app.command("recover")(session.standalone(recover))

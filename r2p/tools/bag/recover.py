@@ -34,7 +34,7 @@ async def recover(
     path = output or file.with_name(f"{file.stem}-recovered.mcap")
     report = RecoveryReport()
     with _explained(path), contextlib.closing(recover_in_steps(file, path)) as steps:
-        for report in steps:
+        for report in steps:  # noqa: B007 - the last one counts
             await asyncio.sleep(0)  # Ctrl-C
     if report.complete:
         notify(f"{file} is complete: there is nothing to recover")
