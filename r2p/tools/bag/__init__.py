@@ -1,8 +1,7 @@
 """`r2p bag`: recordings of topics, CAN frames and what happened to them, in files.
 
 `record` writes a file, and `convert` makes files of other formats of it, and it of those. `frames` shows the CAN frames
-in one;
-`recover` makes a file whole that was cut off.
+in one, and `recover` makes a file whole that was cut off.
 """
 
 from r2p.tools import session
