@@ -84,7 +84,7 @@ def recover_in_steps(
     path, complete = Path(target), False
     with contextlib.closing(RecordFile(Path(source))) as file, path.open("xb") as new:
         try:
-            recovery = Recovery(file, new)
+            recovery = RecordingRecovery(file, new)
             yield from recovery.run()
             complete = recovery.report.complete
         except BaseException:
@@ -94,7 +94,7 @@ def recover_in_steps(
         path.unlink()
 
 
-class Recovery:
+class RecordingRecovery:
     """Reads one file to its end, or to the cut, and writes what is whole."""
 
     def __init__(self, source: RecordFile, target: BinaryIO) -> None:
