@@ -92,6 +92,8 @@ from r2p.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from r2p.recording.bag import Bag
+    from r2p.recording.disk import RecordingOptions
+    from r2p.recording.recorder import Recorder
 
 __all__ = [
     "Array",
@@ -152,6 +154,8 @@ __all__ = [
     "PublisherClass",
     "PublisherStatistics",
     "ReasonCount",
+    "Recorder",
+    "RecordingOptions",
     "RemoteNodes",
     "RemoteSwap",
     "RouteStatistics",
@@ -193,7 +197,11 @@ __all__ = [
     "u64",
 ]
 
-_OF_RECORDINGS = {"Bag": "r2p.recording.bag"}
+_OF_RECORDINGS = {
+    "Bag": "r2p.recording.bag",
+    "Recorder": "r2p.recording.recorder",
+    "RecordingOptions": "r2p.recording.disk",
+}
 """What is imported when it is used first: most programs record nothing, and need no extra for it."""
 
 

@@ -178,14 +178,16 @@ class NetworkView:
         """Return the nodes of a module, this one or any r2p module, to list, start, stop, restart and swap them."""
         return RemoteNodes(self.ask, module)
 
-    async def message_type(self, fingerprint: bytes) -> type[Message] | None:
+    async def message_type(self, fingerprint: bytes, topic: str = "") -> type[Message] | None:
         """Ask the modules on the network for a message class of this layout; None without an answer.
+
+        `topic`: the one whose class is meant, where several have this layout.
 
         Modules that publish or subscribe to a topic of the type are asked, on any link and through gateways. It takes
         as long as its schema on a slow line, and some seconds if the modules are silent.
         """
         module = self._opened()
-        return await find_type(module.links, module.own_services, fingerprint)
+        return await find_type(module.links, module.own_services, fingerprint, topic)
 
     async def parameters(self, module: str, node: str | None = None) -> list[ParameterInfo]:
         """Fetch the parameters of a module, this one or any r2p module on the network; of one node or all.

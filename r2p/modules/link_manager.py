@@ -190,6 +190,8 @@ class LinkManager:
     def _topic_changed(self, topic: Topic) -> None:
         for link in self.links:  # an error of one of them concerns neither the user nor the others
             link.stats.lost.guard(link.topic_changed, topic)
+        for listener in list(self.space.listeners):
+            listener(topic)
 
     # Called by transports
 

@@ -93,6 +93,8 @@ def _holders_on(link: Link, fingerprint: bytes, topic: str) -> Iterator[tuple[in
     topics = {info.name for info in link.discovery.topics.values() if info.fingerprint == fingerprint}
     if topic:
         topics = {name for name in topics if _is_same_topic(name, topic)} or topics
+    if topic and not topics:  # a publisher that has returned with another type, while the one of before is remembered
+        topics = {name for name in link.discovery.topics if _is_same_topic(name, topic)}
     if not topics:
         return
     roles: dict[int, int] = {}

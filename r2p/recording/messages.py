@@ -12,15 +12,43 @@ _NAME_MAX = 255
 TEXT_MAX, VALUE_MAX = 1023, 1 << 16
 """Bytes of texts for people, and of the values of parameters."""
 
+TOPICS_MAX = 4096
+"""Topics of one message of the recorder's losses."""
+
 EVENTS, SIGNALS, BUSES, SLOTS, PARAMETERS = (
     f"{OWN_PREFIX}{name}" for name in ("events", "signals", "buses", "slots", "parameters")
 )
 """The channels of these messages."""
+LOSSES = f"{OWN_PREFIX}recorder"
+"""The channel of the recorder's own losses."""
 BUS_LOADS, STATISTICS = f"{OWN_PREFIX}bus_load", f"{OWN_PREFIX}statistics"
 """What the channels of the loads of buses, and of the statistics of modules, begin with."""
 
 _Name = Annotated[str, Max(_NAME_MAX)]
 _Text = Annotated[str, Max(TEXT_MAX)]
+
+
+class TopicLosses(Message, name="r2p_msgs/TopicLosses"):
+    """Messages of a topic that are not in the recording, since it began.
+
+    `dropped` ones arrived, and the disk was too slow or full; `missed` ones were lost before, on their way to the
+    recorder, by the numbers of their publishers.
+    """
+
+    topic: _Name = ""
+    dropped: u64 = 0
+    missed: u64 = 0
+
+
+class RecorderLosses(Message, name="r2p_msgs/RecorderLosses"):
+    """What the recorder has lost since it began, once a second and at the end (channel `/r2p/recorder`).
+
+    `messages` were received; of the topics only those are listed that have losses. `queued_bytes` wait for the disk.
+    """
+
+    messages: u64 = 0
+    queued_bytes: u64 = 0
+    topics: Annotated[tuple[TopicLosses, ...], Max(TOPICS_MAX)] = ()
 
 
 class SampleMeta(Message, name="r2p_msgs/SampleMeta"):

@@ -1,31 +1,50 @@
-"""Records the topics of a module's network into a bag."""
+"""Records the topics of a module's network, and what happens there, into a bag.
 
-import asyncio
-import contextlib
+    a message arrives -> RecordedTopic appends it to a list, in the event loop
+    _TURN later       -> the list goes to the Disk, whose thread writes it
+
+Nothing waits for the recorder: neither a publisher, nor a link, nor the event loop. What is recorded besides topics are
+parts of the recorder: each is an asynchronous context manager, made with the module and with a function that takes what
+is to be written.
+"""
+
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from fnmatch import fnmatchcase
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from r2p.messages import Message, layout
+import msgspec
+
+from r2p.clock import Alarm
+from r2p.errors import Closed, Error, InvalidName
+from r2p.log_lines import get_logger
+from r2p.messages import Message
 from r2p.modules.module import Module
 from r2p.names import RESERVED, topic_name
-from r2p.recording.samples import SampleWriter
-from r2p.recording.writer import BagWriter
-from r2p.ros.classes import standard_classes
-from r2p.runtime.immediate import ImmediateSubscriber
+from r2p.recording.disk import Disk, RecordingOptions
+from r2p.recording.entries import BagEntry, MessageEntry
+from r2p.recording.messages import LOSSES, TOPICS_MAX, RecorderLosses, TopicLosses
+from r2p.recording.observations import Observations
+from r2p.recording.topics import RecordedTopic, TypeFinder
 from r2p.runtime.node import Node
-from r2p.runtime.sample import Sample, Source
+from r2p.runtime.queues import Pulse
+from r2p.runtime.topic import Topic
+from r2p.units import MILLISECOND, SECOND
 
-RECORDER = "recorder"
+logger = get_logger("r2p.recording")
+
+NODE = "recorder"
 """The name of the node that subscribes to what is recorded."""
 
-_PERIOD = 0.05  # seconds between two looks for new topics, after which what has arrived is written
-_WILDCARDS = frozenset("*?[")
+Part = Callable[[Module, Callable[[BagEntry], object]], AbstractAsyncContextManager[object]]
+"""Makes a part of the recorder."""
 
-_Received = tuple[str, Sample, type[Message] | None, int]
+_TURN = 50 * MILLISECOND  # ns between two looks for new topics, after which what has arrived goes to the disk
+_LOSSES_EVERY = SECOND
+_WILDCARDS = frozenset("*?[")
 
 
 class TopicSelection:
@@ -33,31 +52,56 @@ class TopicSelection:
 
     def __init__(self, topics: Iterable[str] | None = None, exclude: Iterable[str] = ()) -> None:
         """Raises InvalidName or NameTooLong for a name that no topic can have."""
-        given = ["*"] if topics is None else [each.removeprefix("/") for each in topics]
-        self.names = [topic_name(each) for each in given if not _is_pattern(each)]
-        """The topics that are named in full: they are recorded from the start."""
+        given = ["*"] if topics is None else [each.removeprefix("/") for each in _names(topics)]
+        self._excluded = [each.removeprefix("/") for each in _names(exclude)]
         self._patterns = [each for each in given if _is_pattern(each)]
-        self._excluded = [each.removeprefix("/") for each in exclude]
+        named = [topic_name(each) for each in given if not _is_pattern(each)]
+        if reserved := next((each for each in named if each in RESERVED), None):
+            raise InvalidName(f"topic {reserved} has messages of r2p itself, which can't be recorded")
+        self.names = [each for each in dict.fromkeys(named) if not self._is_excluded(each)]
+        """The topics that are named in full: they are recorded from the start."""
 
     def has(self, topic: str) -> bool:
         """Return whether a topic is to be recorded."""
-        if topic in RESERVED or any(fnmatchcase(topic, each) for each in self._excluded):
+        if topic in RESERVED or self._is_excluded(topic):
             return False
         return topic in self.names or any(fnmatchcase(topic, each) for each in self._patterns)
+
+    def _is_excluded(self, topic: str) -> bool:
+        return any(fnmatchcase(topic, each) for each in self._excluded)
+
+
+def _names(given: Iterable[str]) -> list[str]:
+    """Return names as a list: a single text would be one of letters."""
+    return [given] if isinstance(given, str) else list(given)
 
 
 def _is_pattern(text: str) -> bool:
     return not _WILDCARDS.isdisjoint(text)
 
 
+class TopicCount(msgspec.Struct, frozen=True):
+    """What a recording has of a topic so far: `messages` that were received; of these `dropped` as the disk was too
+    slow or full; and those that were `missed`, lost before they reached the recorder, by their publishers' numbers.
+    """
+
+    messages: int = 0
+    dropped: int = 0
+    missed: int = 0
+
+
 class Recorder:
-    """Records topics into a file, while its block runs.
+    """Records topics into a file while its block runs.
 
         async with r2p.Recorder(module, "drive.mcap", ["odometry", "camera/*"]):
             await module.wait()
 
-    `topics` are names or patterns, None for all; topics that appear later are recorded from then on. `exclude` are
-    patterns of topics to leave out. `types` has, by topic, the types of messages that no other module can tell.
+    `topics` are names and patterns, None for all; topics that appear later are recorded from then on. `exclude` are
+    names and patterns of topics to leave out. `types` has, by topic, the types of messages that no module announces.
+    `options` say how the file is written: limits, several files, snapshots. `parts` record what is not a message: what
+    happens on the network, unless others are given.
+
+    Raises InvalidName or NameTooLong for a name that no topic can have.
     """
 
     def __init__(
@@ -68,90 +112,184 @@ class Recorder:
         *,
         exclude: Iterable[str] = (),
         types: Mapping[str, type[Message]] | None = None,
+        options: RecordingOptions | None = None,
+        parts: Iterable[Part] = (Observations,),
     ) -> None:
         self.path = Path(path)
-        self.messages: dict[str, int] = {}
-        """The messages that were recorded, by topic."""
         self._module = module
         self._selection = TopicSelection(topics, exclude)
-        self._types = types or {}
-        self._topics: dict[str, _RecordedTopic] = {}
-        self.received: list[_Received] = []
-        """What has arrived since the last write."""
+        self._stated = {name.removeprefix("/"): cls for name, cls in (types or {}).items()}
+        self._options = options or RecordingOptions()
+        self._parts = list(parts)
+        self._topics: dict[str, RecordedTopic] = {}
+        self._entries: list[BagEntry] = []
+        self._generations: list[tuple[int, int]] = []
+        self._losses_at = 0
+        self._ended = Pulse()
+        self._disk: Disk | None = None
+        self._stack = AsyncExitStack()
+
+    # What a program reads
+
+    @property
+    def started(self) -> bool:
+        """Whether the recording has begun; True also after its end."""
+        return self._disk is not None
+
+    @property
+    def keeps(self) -> bool:
+        """Whether the recorder keeps the last seconds in memory, for snapshots, and writes nothing else."""
+        return self._options.snapshot > 0.0
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files so far, oldest first. Raises Closed before the recorder was started."""
+        return self._opened.paths
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes in the files so far. Raises Closed before the recorder was started."""
+        return self._opened.bytes_written
+
+    @property
+    def stopped(self) -> str:
+        """The reason why the recording has ended by itself, such as a full disk; empty while it goes on."""
+        return "" if self._disk is None else self._disk.stopped
+
+    def counts(self) -> dict[str, TopicCount]:
+        """Return what was received and lost so far, by topic. Raises Closed before the recorder was started."""
+        dropped = self._opened.lost
+        return {
+            name: TopicCount(topic.messages + topic.rejected, dropped.get(name, 0) + topic.rejected, topic.missed)
+            for name, topic in sorted(self._topics.items())
+        }
+
+    async def wait(self) -> None:
+        """Wait until the recording ends by itself: at a limit, or as the disk is full. `stopped` says why."""
+        while not self.stopped:
+            await self._ended.wait()
+
+    async def snapshot(self) -> Path:
+        """Write the last seconds (`snapshot` of the options) into a file, and return its path.
+
+        Raises Error if the recorder keeps none, OSError if the file can't be written, and Closed unless it runs.
+        """
+        if not self.keeps:
+            raise Error("the recorder keeps no last seconds in memory: start it with snapshot= in its options")
+        self._hand_over()
+        return await self._opened.snapshot()
+
+    @property
+    def _opened(self) -> Disk:
+        if self._disk is None:
+            raise Closed(f"the recorder of {self.path} was not started: use it in an `async with` block")
+        return self._disk
+
+    # The beginning and the end
 
     async def __aenter__(self) -> Self:
-        """Begin to record. Raises FileExistsError if there is such a file, and OSError if it can't be made."""
-        self._node = Node(RECORDER, self._module.space)
-        self._file = self.path.open("xb")
-        self._writer = BagWriter(self._file)
-        self._samples = SampleWriter(self._writer)
-        for name in self._selection.names:
-            self._record(name)
-        self._follow()
-        self._task = asyncio.create_task(self._run(), name=f"{self._module.name} {RECORDER}")
+        """Begin to record. Raises FileExistsError if the file exists, OSError if it can't be made, and Closed if the
+        module is not open.
+        """
+        if self._disk is not None:
+            raise Error(f"the recorder of {self.path} was started before: make a new one")
+        space = self._module.space
+        self._disk = Disk(self.path, self._options, space.clock, logger.warning)
+        self._stack.push_async_callback(self._disk.close)
+        try:
+            await self._begin()
+        except BaseException:
+            await self._stack.aclose()
+            raise
         return self
+
+    async def _begin(self) -> None:
+        space = self._module.space
+        self._node = Node(NODE, space)
+        self._types = TypeFinder(self._module, self._stated)
+        self._alarm = Alarm(space.loop, self._turn, background=True)
+        self._stack.callback(self._finish)
+        for part in self._parts:
+            await self._stack.enter_async_context(part(self._module, self._entries.append))
+        for name in self._selection.names:
+            self._consider(name)
+        for topic in list(space.topics.values()):
+            self._own_changed(topic)
+        space.listeners.append(self._own_changed)
+        self._stack.callback(space.listeners.remove, self._own_changed)
+        self._turn()
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the file."""
-        self._task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await self._task
-        for each in self._topics.values():
-            each.sink.close()
-        self._node.close()
-        self._write()
-        self._writer.finish()
-        self._file.close()
+        """End the subscriptions, write what has arrived, and end the file."""
+        await self._stack.aclose()
 
-    async def _run(self) -> None:
-        while True:
-            await asyncio.sleep(_PERIOD)
-            self._follow()
-            self._write()
+    def _finish(self) -> None:
+        self._alarm.close()
+        self._types.close()
+        for each in self._topics.values():
+            each.close()
+        self._node.close()
+        self._hand_over()
+        self._put_losses()
+        self._hand_over()
+
+    # While it runs
+
+    def _turn(self) -> None:
+        """Look for new topics, and hand over what has arrived."""
+        now = self._module.space.clock.monotonic()
+        self._follow()
+        for topic in self._topics.values():
+            topic.poll(now)
+        if now >= self._losses_at:
+            self._losses_at = now + _LOSSES_EVERY
+            self._put_losses()
+        self._hand_over()
+        if self.stopped:
+            self._ended.emit()
+        self._alarm.set(now + _TURN)
 
     def _follow(self) -> None:
-        """Record the topics that have appeared."""
-        for name, view in self._module.network.topics().items():
-            if (view.publishers or view.published_on) and name not in self._topics and self._selection.has(name):
-                self._record(name)
+        """Record topics that have appeared, and look for other types, if anything has changed in discovery."""
+        links = self._module.links
+        for link in links:
+            for info in list(link.discovery.topics.values()):
+                if info.advertised_at is not None and link.discovery.topic_behind(info.name) == info.name:
+                    self._consider(info.name)
+        generations = [(id(link), link.discovery.generation) for link in links]
+        if generations != self._generations:
+            self._generations = generations
+            for topic in self._topics.values():
+                topic.review()
+
+    def _own_changed(self, topic: Topic) -> None:
+        """Record a topic that this module publishes, from its first message on."""
+        if topic.publishers:
+            self._consider(topic.name)
+
+    def _consider(self, name: str) -> None:
+        if name not in self._topics and self._selection.has(name):
+            self._record(name)
 
     def _record(self, name: str) -> None:
-        self.messages[name] = 0
-        self._topics[name] = _RecordedTopic(self._module, self._node, self._types.get(name), name, self.received)
+        topic = self._topics[name] = RecordedTopic(self._node, name, self._types, self._entries.append)
+        topic.open()
 
-    def _write(self) -> None:
-        for topic, sample, cls, log_time in self.received:
-            self.messages[topic] += 1
-            self._samples.write(topic, sample, cls, log_time)
-        self.received.clear()
+    def _hand_over(self) -> None:
+        if self._entries:
+            self._opened.put(self._entries.copy())  # a copy: the topics go on with this list
+            self._entries.clear()
 
-
-class _RecordedTopic:
-    """One topic: its subscription, and the type of each of its publishers."""
-
-    def __init__(
-        self, module: Module, node: Node, cls: type[Message] | None, name: str, received: list[_Received]
-    ) -> None:
-        self._space = module.space
-        self._name = name
-        self._cls = cls
-        self._received = received
-        self._types: dict[Source, type[Message] | None] = {}
-        self.sink = ImmediateSubscriber(module.space, node, self._handle, lossy=True)
-        self._topic = self.sink.open(name, None)
-
-    def _handle(self, sample: Sample) -> None:
-        source = sample.source
-        if source not in self._types:
-            self._types[source] = self._cls or self._find(source)
-        self._received.append((self._name, sample, self._types[source], self._space.clock.now()))
-
-    def _find(self, source: Source) -> type[Message] | None:
-        own = self._topic.layout
-        fingerprint = self._space.fingerprint_of(self._topic, source)
-        if own is not None and (not source.link or own.fingerprint == fingerprint):
-            return own.cls
-        known = (cls for cls in standard_classes().values() if layout(cls).fingerprint == fingerprint)
-        return next(known, None)
+    def _put_losses(self) -> None:
+        counts = self.counts()
+        lossy = [
+            TopicLosses(name, each.dropped, each.missed) for name, each in counts.items() if each.dropped or each.missed
+        ]
+        losses = RecorderLosses(
+            messages=sum(each.messages for each in counts.values()),
+            queued_bytes=self._opened.queued_bytes,
+            topics=tuple(lossy[:TOPICS_MAX]),
+        )
+        self._entries.append(MessageEntry(LOSSES, losses, self._module.space.clock.now()))

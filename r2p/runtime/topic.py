@@ -359,6 +359,8 @@ class TopicSpace:
         """Get each signal of each publisher of this module, also those that the log leaves out; they must not raise."""
         self.changed: Callable[[Topic], None] = lambda _topic: None
         """Callback after a publisher or a subscriber of this module was added or removed."""
+        self.listeners: list[Callable[[Topic], None]] = []
+        """More callbacks of that kind."""
 
     def open(self, name: str, layout: Layout[Any] | None) -> Topic:
         """Return the topic for a new user. Raises TypeMismatch if it has another layout (`None` fits any)."""

@@ -3,6 +3,7 @@
 Each is a type for a parameter of a command, as Typer reads it: `async def echo(session, *, timeout: Timeout = None)`.
 """
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -34,6 +35,22 @@ def seconds(text: str) -> float:
     if not SHORTEST <= value <= LONGEST:
         raise typer.BadParameter(f"{text!r}: the time must be from {SHORTEST:g} to {LONGEST:g} s")
     return value
+
+
+def long_seconds(text: str) -> float:
+    """Parse a duration that may have minutes and hours: "90", "500ms", "10m", "2h"."""
+    unit = {"m": 60.0, "h": 3600.0}.get(text.strip()[-1:])
+    return seconds(text) if unit is None else seconds(text.strip()[:-1]) * unit
+
+
+def byte_size(text: str) -> int:
+    """Parse a number of bytes: "4096", "500k", "1.5G" (powers of 1000), "64KiB" (powers of 1024)."""
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)\s*([kKMGT]?)(i?)B?", text.strip())
+    if match is None or (match[3] and not match[2]):
+        raise typer.BadParameter(f"{text!r} is not a size: write 500M, 1.5G or 64KiB")
+    power = "kMGT".index(match[2].replace("K", "k")) + 1 if match[2] else 0
+    factor: int = (1024 if match[3] else 1000) ** power
+    return round(float(match[1]) * factor)
 
 
 def class_choice(text: str) -> ClassOf:

@@ -1,72 +1,267 @@
 """`r2p bag record`: record topics into a file, until Ctrl-C."""
 
 import asyncio
-from collections.abc import Mapping
+import contextlib
+import functools
+import logging
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import typer
 
+import r2p
 from r2p.clock import local_time
+from r2p.ros.std_srvs import Trigger
 from r2p.tools.completion import complete_topic
-from r2p.tools.options import topic_pattern
-from r2p.tools.output import notify
-from r2p.tools.session import Session, Settings, UsageError
-from r2p.tools.types import Types
+from r2p.tools.config import find
+from r2p.tools.keyboard import on_key
+from r2p.tools.options import Format, byte_size, long_seconds, topic_pattern
+from r2p.tools.output import Output, notify
+from r2p.tools.session import Session, Settings, UsageError, call_after
+from r2p.tools.topic.watching import HINT_AFTER, is_published, suggest_topics
+from r2p.tools.types import Types, is_service, load_service
+from r2p.units import SECOND
 
 if TYPE_CHECKING:
-    import r2p
+    from r2p.recording.disk import RecordingOptions
+    from r2p.recording.recorder import Part, Recorder
+
+SNAPSHOT_SERVICE = "bag/snapshot"
+"""The service, of type std_srvs/Trigger, that writes the last seconds into a file."""
+
+_MIN_FREE = 1_000_000_000  # bytes
+_ANSWER_MAX = 160  # characters of an answer to that service, which all links carry
+_LIMITS = ("max_size", "max_duration", "split", "snapshot", "min_free", "max_total")
 
 
 def check(settings: Settings, given: Mapping[str, Any]) -> None:
     """Raise UsageError for topics and options that make no sense."""
-    if not given["topics"] and not given["all"]:
+    if not given["topics"] and not given["all"] and not given["frames"]:
         raise UsageError("nothing to record: name topics, such as odometry or 'camera/*', or give -a for all")
-    for each in given["topics"] or ():
-        topic_pattern(each.removeprefix("/"), "TOPIC")
-    for each in given["exclude"] or ():
-        topic_pattern(each.removeprefix("/"), "--exclude")
+    if given["topics"] and given["all"]:
+        raise UsageError("-a records all topics: leave out either -a or the topics; --exclude leaves out some")
+    for option, texts in (("TOPIC", given["topics"]), ("--exclude", given["exclude"])):
+        for each in texts or ():
+            topic_pattern(each.removeprefix("/"), option)
+    if given["frames"] and not _buses(settings):
+        raise UsageError("--frames records the CAN buses of --via: give --via rtcan:can0 (or a sim: URL)")
+    _stated_types(settings, given["topics"], given["type"])
+    _options({name: given[name] for name in _LIMITS})
+    output = given["output"]
+    if output is not None and (output.exists() or not output.parent.is_dir()):
+        reason = "exists, and is never overwritten: give another" if output.exists() else "is in no directory: give an"
+        raise UsageError(f"{output} {reason} -o FILE")
+
+
+_Topics = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="TOPIC", autocompletion=complete_topic, help="Names, patterns such as 'camera/*'.", show_default=False
+    ),
+]
+_All = Annotated[bool, typer.Option("--all", "-a", help="All topics, also those that appear later.")]
+_FILE = "Default: r2p-YYYYMMDD-HHMMSS.mcap here."
+_Output = Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE", help=_FILE, show_default=False)]
+_Exclude = Annotated[
+    list[str] | None, typer.Option("--exclude", metavar="PATTERN", help="Leave these topics out (repeatable).")
+]
+_Frames = Annotated[bool, typer.Option("--frames", help="All frames of the CAN buses of --via, too.")]
+_StatedTypes = Annotated[
+    list[str] | None,
+    typer.Option("--type", metavar="TOPIC=TYPE", help="Types that no module announces (repeatable)."),
+]
+_Split = Annotated[bool, typer.Option("--split", help="Go on in another file there: FILE-0001.mcap, ...-0002.mcap.")]
+
+
+def _size(name: str, help: str) -> Any:
+    return typer.Option(name, parser=byte_size, metavar="SIZE", help=help)
+
+
+def _time(name: str, help: str) -> Any:
+    return typer.Option(name, parser=long_seconds, metavar="TIME", help=help)
 
 
 async def record(
     session: Session,
-    topics: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="TOPIC", autocompletion=complete_topic, help="Names and patterns: 'camera/*'."),
-    ] = None,
+    topics: _Topics = None,
     *,
-    all: Annotated[bool, typer.Option("--all", "-a", help="All topics, also those that appear later.")] = False,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Default: r2p-YYYYMMDD-HHMMSS.mcap here.")
+    all: _All = False,
+    output: _Output = None,
+    exclude: _Exclude = None,
+    frames: _Frames = False,
+    type: _StatedTypes = None,
+    max_size: Annotated[int | None, _size("--max-size", "End at this size: 500M, 2G.")] = None,
+    max_duration: Annotated[float | None, _time("--max-duration", "End after this long: 90, 10m, 2h.")] = None,
+    split: _Split = False,
+    max_total: Annotated[int | None, _size("--max-total", "With --split: delete the oldest files.")] = None,
+    min_free: Annotated[int | None, _size("--min-free", "End when less is free; default: 1G, 0: off.")] = None,
+    snapshot: Annotated[
+        float | None, _time("--snapshot", f"Keep this long in memory; SIGUSR1, s and {SNAPSHOT_SERVICE} write it.")
     ] = None,
-    exclude: Annotated[
-        list[str] | None, typer.Option("--exclude", metavar="PATTERN", help="Leave these topics out (repeatable).")
-    ] = None,
+    format: Format = None,
 ) -> None:
-    """Record the messages of topics into a file, until Ctrl-C."""
+    """Record topics into a file, until Ctrl-C.
+
+    Nothing waits for the recorder; what it loses is counted, and printed at the end.
+    """
     from r2p.recording.recorder import Recorder  # only here, as it takes a while
 
-    path = output or _default_path(session.node.now())
-    types = _stated_types(session.settings)
-    recorder = Recorder(session.module, path, None if all else topics, exclude=exclude or (), types=types)
+    limits = (max_size, max_duration, split, snapshot, min_free, max_total)
+    recorder = Recorder(
+        session.module,
+        output or Path(local_time(session.module.space.clock.now(), "r2p-%Y%m%d-%H%M%S.mcap")),
+        None if all else topics or [],
+        exclude=exclude or (),
+        types=_stated_types(session.settings, topics, type),
+        options=_options(dict(zip(_LIMITS, limits, strict=True))),
+        parts=_parts(session.settings, frames=frames),
+    )
+    await _record(session, recorder, Output(format), topics or [])
+
+
+async def _record(session: Session, recorder: "Recorder", output: Output, topics: list[str]) -> None:
+    clock = session.module.space.clock
+    began = clock.monotonic()
     try:
         async with recorder:
-            notify(f"recording into {path}; Ctrl-C ends it")
-            await asyncio.get_running_loop().create_future()
-    except FileExistsError as error:
-        raise UsageError(f"{path} is there already, and is not overwritten: give another -o FILE") from error
+            with _snapshots(session, recorder), _hints(session, topics):
+                await recorder.wait()
+    except OSError as error:
+        raise r2p.Error(f"can't write {recorder.path}: {error.strerror}") from error
     finally:
-        if recorder.messages:
-            notify(f"{sum(recorder.messages.values())} messages in {path}")
+        if recorder.started:
+            await _print_summary(recorder, output, (clock.monotonic() - began) / SECOND)
+    if not recorder.stopped.startswith("max_"):
+        raise r2p.Error(f"the recording has ended early: {recorder.stopped}")
 
 
-def _default_path(now: int) -> Path:
-    """Return the name of a recording that begins now (UTC, ns)."""
-    return Path(local_time(now, "r2p-%Y%m%d-%H%M%S.mcap"))
+async def _print_summary(recorder: "Recorder", output: Output, seconds: float) -> None:
+    """Print what was recorded and lost, by topic."""
+    counts = recorder.counts()
+    total = sum(each.messages - each.dropped for each in counts.values())
+    files = ", ".join(map(str, recorder.paths)) or "no file"
+    notify(f"{total} messages in {seconds:.1f} s, {recorder.bytes_written / 1e6:.1f} MB: {files}")
+    rows = [{"topic": topic, **msgspec.structs.asdict(each)} for topic, each in counts.items()]
+    await output.table(rows, ["topic", "messages", "dropped", "missed"])
 
 
-def _stated_types(settings: Settings) -> "dict[str, type[r2p.Message]]":
-    """Return the types of topics that r2p.toml states."""
+@contextlib.contextmanager
+def _hints(session: Session, topics: list[str]) -> Iterator[None]:
+    """Report after a while which of the topics have no publisher."""
+
+    def report() -> None:
+        views = session.module.network.topics()
+        names = [each.removeprefix("/") for each in topics]
+        for name in names:
+            if not any(fnmatchcase(each, name) for each, view in views.items() if is_published(view)):
+                notify(f"{name} has no publisher yet{suggest_topics(session, name, is_published)}")
+        if not names and not any(map(is_published, views.values())):
+            notify(session.none_yet("topics"))
+
+    with call_after(HINT_AFTER, report):
+        yield
+
+
+@contextlib.contextmanager
+def _snapshots(session: Session, recorder: "Recorder") -> Iterator[None]:
+    """Write a snapshot at SIGUSR1, at the key s, and when the service is called."""
+    if not recorder.keeps:
+        with _on_sigusr1(lambda: notify("there is no snapshot to write: start with --snapshot 30s")):
+            notify(f"recording into {recorder.path}; Ctrl-C ends it")
+            yield
+        return
+    tasks: set[asyncio.Task[Trigger.Response]] = set()
+
+    async def write(_request: Trigger.Request | None = None) -> Trigger.Response:
+        try:
+            path = await recorder.snapshot()
+        except (r2p.Error, OSError) as error:
+            notify(f"no snapshot: {error}")
+            return Trigger.Response(success=False, message=f"{error}"[:_ANSWER_MAX])
+        notify(f"snapshot: {path}")
+        return Trigger.Response(success=True, message=f"{path}"[-_ANSWER_MAX:])
+
+    def start() -> None:
+        task = asyncio.create_task(write())
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+
+    session.node.log.logger.setLevel(logging.ERROR)  # it would warn of answers that are too long: see _ANSWER_MAX
+    session.node.serve(SNAPSHOT_SERVICE, Trigger, write)
+    with _on_sigusr1(start), on_key(lambda key: start() if key == "s" else None) as has_keyboard:
+        how = "s writes them" if has_keyboard else f"SIGUSR1 and the service {SNAPSHOT_SERVICE} write them"
+        notify(f"keeping the last seconds in memory; {how}, Ctrl-C ends it")
+        yield
+
+
+@contextlib.contextmanager
+def _on_sigusr1(call: Callable[[], object]) -> Iterator[None]:
+    loop = asyncio.get_running_loop()
+    try:
+        loop.add_signal_handler(signal.SIGUSR1, call)
+    except (NotImplementedError, RuntimeError, ValueError):  # under virtual time, or not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        loop.remove_signal_handler(signal.SIGUSR1)
+
+
+def _buses(settings: Settings) -> list[str]:
+    """Return the URLs of CAN buses."""
+    from r2p.recording.frame_recorder import CAN_SCHEMES  # only here, as it takes a while
+
+    return [url for url in settings.via if url.startswith(CAN_SCHEMES)]
+
+
+def _parts(settings: Settings, *, frames: bool) -> "list[Part]":
+    """Return what is recorded besides topics: what happens on the network, r2p.toml, and frames."""
+    from r2p.recording.frame_recorder import FrameRecorder  # only here, as it takes a while
+    from r2p.recording.observations import Observations
+
+    file = find()
+    files = {} if file is None else {file.name: ("application/toml", file.read_bytes())}
+
+    def of_bus(url: str) -> "Part":
+        return lambda _module, add: FrameRecorder(url, lambda entries: [add(each) for each in entries], report=notify)
+
+    observations: Part = functools.partial(Observations, files=files)
+    return [observations, *(of_bus(url) for url in _buses(settings) if frames)]
+
+
+def _options(limits: Mapping[str, Any]) -> "RecordingOptions":
+    """Return the options of the file. Raises UsageError for some that don't go together."""
+    from r2p.recording.disk import RecordingOptions  # only here, as it takes a while
+
+    given = {name: value for name, value in limits.items() if value is not None}
+    try:
+        return RecordingOptions(**{"min_free": _MIN_FREE, **given})
+    except ValueError as error:
+        raise UsageError(f"{error}") from error
+
+
+def _stated_types(
+    settings: Settings, topics: list[str] | None, given: list[str] | None
+) -> dict[str, type[r2p.Message]]:
+    """Return the types of topics that --type or r2p.toml state. Raises UsageError."""
     types = Types(settings)
-    found = {topic: types.stated(topic, None) for topic in settings.types}
-    return {topic: cls for topic, cls in found.items() if cls is not None}
+    stated: dict[str, type[r2p.Message]] = {}
+    for name, text in settings.types.items():
+        if is_service(text):
+            service = load_service(name, text)
+            stated |= {service.request_topic: service.requests.cls, service.response_topic: service.responses.cls}
+        elif (cls := types.stated(name, None)) is not None:
+            stated[name] = cls
+    for text in given or ():
+        topic, equals, name = text.partition("=")
+        if not equals and topics is not None and len(topics) == 1:
+            topic, name = topics[0], text
+        if not (topic and name):
+            raise UsageError(f"--type {text}: write it as TOPIC=TYPE, such as odometry=nav_msgs/Odometry")
+        stated[topic.removeprefix("/")] = types.load(name)
+    return stated

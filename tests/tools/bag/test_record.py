@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+import contextlib
+import signal
+from typing import TYPE_CHECKING, Any
 
 import pytest
+import typer
 
 from r2p.msg import Led
 from r2p.recording.bag import Bag
-from r2p.tools.bag.record import record
-from tests.tools.rig import robot, tool
+from r2p.ros.std_srvs import Trigger
+from r2p.tools.bag.record import SNAPSHOT_SERVICE, check, record
+from r2p.tools.options import byte_size, long_seconds
+from r2p.tools.session import Settings, UsageError
+from tests.tools.rig import PUBLISH, listening, printed, process, robot, tool
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     import r2p
+
+GIVEN: dict[str, Any] = {
+    **dict.fromkeys(("topics", "exclude", "type", "output", "max_size", "max_duration", "max_total", "min_free")),
+    "all": False,
+    "frames": False,
+    "split": False,
+    "snapshot": None,
+}
 
 
 async def leds(node: r2p.Node) -> None:
@@ -24,15 +39,117 @@ async def leds(node: r2p.Node) -> None:
         await publisher.publish(Led(led=publisher.sent, value=1))
 
 
+@contextlib.asynccontextmanager
+async def recording(*args: Any, **options: Any) -> AsyncIterator[None]:
+    """`r2p bag record` in the block, ended as by Ctrl-C."""
+    task = asyncio.create_task(record(*args, **options))
+    await asyncio.sleep(0)
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+def values(path: Path) -> list[int]:
+    with Bag(path) as bag:
+        return [sample.message.led for sample in bag.samples("leds")]
+
+
 @pytest.mark.virtual_time
-async def test_all_topics_are_recorded_until_a_signal(tmp_path: Path) -> None:
+async def test_all_topics_are_recorded_until_a_signal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "one.mcap"
+    async with robot(leds), tool() as session, recording(session, all=True, output=path):
+        await asyncio.sleep(2.0)
+    recorded = values(path)
+    assert recorded == list(range(recorded[0], recorded[0] + len(recorded)))
+    assert len(recorded) >= 15
+    assert printed(capsys)[0] == {"topic": "leds", "messages": len(recorded), "dropped": 0, "missed": 0}
+
+
+@pytest.mark.virtual_time
+async def test_it_ends_at_a_limit_and_names_topics_without_a_publisher(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "one.mcap"
     async with robot(leds), tool() as session:
-        task = asyncio.create_task(record(session, all=True, output=path))
+        await record(session, ["leds", "led"], output=path, max_duration=3.0)
+    assert "led has no publisher yet; did you mean leds?" in capsys.readouterr().err
+    assert 20 <= len(values(path)) <= 30
+
+
+@pytest.mark.virtual_time
+async def test_a_service_writes_the_last_seconds(tmp_path: Path) -> None:
+    path = tmp_path / "last.mcap"
+    async with robot(leds) as bot, tool() as session, recording(session, all=True, output=path, snapshot=1.0):
+        await asyncio.sleep(10.0)
+        answers: list[Trigger.Response] = []
+
+        async def ask(node: r2p.Node) -> None:
+            answers.append(await node.client(SNAPSHOT_SERVICE, Trigger).call(Trigger.Request(), timeout=5.0))
+
+        bot.start(ask)
         await asyncio.sleep(2.0)
-        task.cancel()
-        await asyncio.wait([task])
-    with Bag(path) as bag:
-        values = [sample.message.led for sample in bag.samples("leds")]
-    assert values == list(range(values[0], values[0] + len(values)))
-    assert len(values) >= 15
+    assert answers == [Trigger.Response(success=True, message=f"{tmp_path}/last-0001.mcap")]
+    assert 8 <= len(values(tmp_path / "last-0001.mcap")) <= 20
+
+
+@pytest.mark.processes
+def test_a_process_ends_its_file_and_writes_snapshots_at_signals(tmp_path: Path) -> None:
+    path = tmp_path / "one.mcap"
+    with process(*PUBLISH) as robot:
+        arguments = ("bag", "record", "leds", "-o", str(path), "--via", listening(robot))
+        with process(*arguments, "--snapshot", "1m", "--min-free", "0") as child:
+            assert child.stderr is not None
+            assert "keeping the last seconds" in child.stderr.readline()
+            child.send_signal(signal.SIGUSR1)
+            assert f"snapshot: {tmp_path}/one-0001.mcap" in child.stderr.readline()
+            child.terminate()
+            assert child.wait() == 0
+        with process(*arguments, "--max-duration", "1", "--min-free", "0") as child:
+            output, _ = child.communicate()
+            assert child.returncode == 0
+    assert '"topic": "leds"' in output
+    assert values(path)
+
+
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [
+        ({}, "name topics, such as odometry or 'camera/\\*', or give -a"),
+        ({"topics": ["leds"], "all": True}, "leave out either -a or the topics"),
+        ({"topics": ["no topic"]}, "TOPIC: no topic can match 'no topic'"),
+        ({"all": True, "exclude": ["a b"]}, "--exclude: no topic can match"),
+        ({"all": True, "type": ["Led"]}, "write it as TOPIC=TYPE"),
+        ({"all": True, "type": ["leds=Lead"]}, "no message class 'Lead'"),
+        ({"frames": True}, "give --via rtcan:can0"),
+        ({"all": True, "split": True}, "split needs"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(given: dict[str, Any], error: str) -> None:
+    with pytest.raises(UsageError, match=error):
+        check(Settings(), GIVEN | given)
+
+
+def test_an_existing_file_is_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "one.mcap"
+    path.touch()
+    with pytest.raises(UsageError, match="exists, and is never overwritten"):
+        check(Settings(), GIVEN | {"all": True, "output": path})
+    with pytest.raises(UsageError, match="no directory"):
+        check(Settings(), GIVEN | {"all": True, "output": tmp_path / "no" / "one.mcap"})
+
+
+def test_sizes_and_times_have_units() -> None:
+    assert [byte_size(text) for text in ("7", "500k", "1.5G", "64KiB", "2 MB")] == [
+        7,
+        500_000,
+        1_500_000_000,
+        65_536,
+        2_000_000,
+    ]
+    assert [long_seconds(text) for text in ("90", "500ms", "10m", "2h")] == [90.0, 0.5, 600.0, 7200.0]
+    for text in ("", "G", "-1", "1iB", "1e3"):
+        with pytest.raises(typer.BadParameter):
+            byte_size(text)
