@@ -43,16 +43,16 @@ class PlayOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     `topics` and `exclude` are names or patterns as in a shell (`camera/*`); without `topics` all are played but those
     of r2p itself (`log`, `bus_load`, `bus_slots`), of boot loaders and of services: what is named is played in any
-    case. `remap` gives topics other names. `start` and `end` are in seconds after the start of the recording. `rate`:
-    times the speed of the recording. `loop`: begin again at the end, for ever. `clock`: publish the time of the
-    recording as `clock`, and keep the stamps of then.
+    case. `remap` gives topics other names. `start` and `end` are instants of the recording (UTC, ns), without `end`
+    itself. `rate`: times the speed of the recording. `loop`: begin again at the end, for ever. `clock`: publish the
+    time of the recording as `clock`, and keep the stamps of then.
     """
 
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
     remap: Mapping[str, str] = {}
-    start: float = 0.0
-    end: float | None = None
+    start: int | None = None
+    end: int | None = None
     rate: float = 1.0
     loop: bool = False
     clock: bool = False
@@ -149,10 +149,11 @@ class Player:
         ]
         if not wanted:
             raise BagError(self._nothing())
-        if self.start > self._bag.end:
+        if self.start > self._bag.end or self.end < self.start:
             seconds = (self._bag.end - self._bag.start) / SECOND
-            after = f"{self._options.start:g} s on"
-            raise BagError(f"the recording is over after {seconds:.1f} s: there is nothing from {after}")
+            raise BagError(
+                f"nothing to play: no message of the recording, of {seconds:.1f} s, is from `start` to `end`"
+            )
         return [each for each in wanted if self._has_type(each)]
 
     def _nothing(self) -> str:
@@ -188,14 +189,12 @@ class Player:
     @property
     def start(self) -> int:
         """Where in the recording playing begins (UTC, ns)."""
-        return self._bag.start + round(self._options.start * SECOND)
+        return self._bag.start if self._options.start is None else max(self._options.start, self._bag.start)
 
     @property
     def end(self) -> int:
         """Where in the recording playing ends (UTC, ns)."""
-        if self._options.end is None:
-            return self._bag.end
-        return min(self._bag.end, self._bag.start + round(self._options.end * SECOND))
+        return self._bag.end if self._options.end is None else min(self._options.end, self._bag.end)
 
     @property
     def missed(self) -> dict[str, Counter[str]]:
@@ -271,13 +270,13 @@ class Player:
 
     def _records(self) -> Iterator[tuple[int, RecordedSample]]:
         names = {each.recorded for each in self.topics.values()}
-        for record in self._bag.records(names, start=self.start, end=self.end + 1):
+        for record in self._bag.records(names, start=self.start, end=self._options.end):
             yield record.log_time, record
 
     def _play_latched(self) -> None:
         """Publish the latched values from before the start: a subscriber of then had them."""
         latched = {each.recorded for each in self.topics.values() if each.recorded in self._latched}
-        if self._options.start > 0 and latched:
+        if self.start > self._bag.start and latched:
             for record in self._bag.last_before(self.start, latched):
                 self._play(self.start, record)
 
@@ -368,7 +367,7 @@ class Player:
 
     def _read_traits(self, names: set[str]) -> dict[str, TopicTraits]:
         found = {name: TopicTraits() for name in names}
-        for record in itertools.islice(self._bag.records(names, start=self.start, end=self.end + 1), _SURVEYED):
+        for record in itertools.islice(self._bag.records(names, start=self.start, end=self._options.end), _SURVEYED):
             found[record.topic].add(record.sample)
         return found
 

@@ -22,4 +22,29 @@ faults on demand, and with nodes for the test itself:
             leds = node.subscribe("leds", Led)
             imu.start(blink)
             assert (await leds.fetch(timeout=5)).value == 1
+
+`r2p.testing.play` plays a recording to nodes, under virtual time and by the clock of the recording:
+
+    @pytest.mark.virtual_time
+    async def test_odometry() -> None:
+        playback = await r2p.testing.play("drive.mcap", forward_kinematics)
+        assert playback.outputs["odometry"] == playback.recorded["odometry"]
 """
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from r2p.testing.playback import Playback as Playback
+    from r2p.testing.playback import play as play
+
+
+def __getattr__(name: str) -> Any:
+    """Import what plays recordings when it is used: pytest loads this package in every session."""
+    if name not in ("Playback", "play"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import r2p
+
+    getattr(r2p, "Bag")  # noqa: B009 - raises BagError where the extra is not installed
+    from r2p.testing import playback
+
+    return getattr(playback, name)
