@@ -5,7 +5,7 @@ in one, and `recover` makes a file whole that was cut off.
 """
 
 from r2p.tools import session
-from r2p.tools.bag import convert, frames, record
+from r2p.tools.bag import convert, events, frames, record
 from r2p.tools.bag.recover import recover
 
 app = session.group("Record topics to a file, and play, inspect and convert it.")
@@ -13,3 +13,5 @@ session.command(app, "record", endless=lambda _given: True, check=record.check)(
 app.command("frames")(session.standalone(frames.frames))
 app.command("convert")(session.standalone(convert.convert))
 app.command("recover")(session.standalone(recover))
+app.command("events")(session.standalone(events.events))
+app.command("slots")(session.standalone(events.slots))

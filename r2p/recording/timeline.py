@@ -1,0 +1,273 @@
+"""What happened in a recording, in the order of time: events, misses, changes of slots and parameters, and the log.
+
+    for each in timeline(bag, start, end):
+        print(each.time, each.kind, each.about, each.text)
+
+Misses that a recording has one by one come one by one; `collapsed` joins those that repeat within a second.
+"""
+
+import heapq
+import logging
+import re
+from collections.abc import Iterable, Iterator
+from operator import attrgetter, itemgetter
+from typing import Final
+
+import msgspec
+
+from r2p.errors import DecodeError
+from r2p.msg import Log
+from r2p.names import LOG, module_alias
+from r2p.recording.bag import Bag
+from r2p.recording.format import OWN_PREFIX
+from r2p.recording.messages import (
+    EVENTS,
+    PARAMETERS,
+    SIGNALS,
+    SLOTS,
+    ParameterValue,
+    RecordedEvent,
+    RecordedSignal,
+    SampleMeta,
+    SlotOwner,
+    SlotTable,
+)
+from r2p.ros.cdr import cdr
+from r2p.units import SECOND
+
+KINDS: Final = {
+    "link": "links up, down, or waiting for their other end",
+    "module": "modules that come, change their state, go, or are silent",
+    "master": "elections of RTCAN masters, and buses without one",
+    "slots": "slots that a topic gets or loses",
+    "missed": "messages that did not reach every subscriber in time, by their publishers",
+    "late": "messages that were published or sent after their time",
+    "overdue": "messages that came to the recorder after their deadline",
+    "lost": "messages that a subscriber, a link or a gateway dropped",
+    "degraded": "links that no longer meet the class of a publisher",
+    "log": "log records, WARNING and above",
+    "parameter": "changes of parameters",
+    "notice": "other notices: mismatches of types, conflicts of names, ...",
+    "recorder": "messages that the recorder itself lost",
+}
+"""The kinds of happenings, and what they are."""
+
+MISSES: Final = frozenset({"missed", "late", "overdue", "lost", "degraded"})
+"""The kinds that concern messages."""
+
+_KIND_OF_EVENT = {"no answer": "module", "answers": "module", "no master": "master", "events lost": "recorder"}
+_BASELINE = 11 * SECOND  # tables of slots are repeated every ten seconds
+_TOGETHER = SECOND  # ns in which the same happenings are joined
+_LOGGED_MISS = re.compile(r"topic (\S+)(?: \(.*?\))?: (.+) \(missed \d+, late \d+ so far\)")
+
+
+class Happening(msgspec.Struct, frozen=True, kw_only=True):
+    """Something that happened at `time` (UTC, ns), of one of KINDS.
+
+    `about` names the link, module, topic or bus. `count` messages are concerned, the latest by `late` seconds.
+    `sequence` is the number of the message (0: unknown). Several that were joined lasted until `until`.
+    """
+
+    time: int
+    kind: str
+    about: str
+    text: str
+    count: int = 1
+    late: float = 0.0
+    sequence: int = 0
+    until: int = 0
+
+    def joined(self, other: "Happening") -> "Happening":
+        """Return this and a later one as one."""
+        return msgspec.structs.replace(
+            self, count=self.count + other.count, late=max(self.late, other.late), until=other.time
+        )
+
+
+def timeline(bag: Bag, start: int | None = None, end: int | None = None) -> Iterator[Happening]:
+    """Yield what happened from `start` to `end` (UTC, ns; `end` not included; None: of the recording)."""
+    first = bag.start if start is None else start
+    parts = (_events(bag, first, end), _misses(bag, first, end), _slots(bag, first, end), _parameters(bag, first, end))
+    others = (_overdue(bag, first, end), _recorder(bag, first, end))
+    return heapq.merge(*parts, *others, key=attrgetter("time"))
+
+
+def collapsed(happenings: Iterable[Happening]) -> Iterator[Happening]:
+    """Join happenings that repeat within a second of the first one: they differ in time, number and delay only."""
+    waiting: dict[tuple[str, str, str], Happening] = {}
+    for each in happenings:
+        key = each.kind, each.about, each.text
+        while waiting and (oldest := next(iter(waiting.values()))).time < each.time - _TOGETHER:
+            yield waiting.pop((oldest.kind, oldest.about, oldest.text))
+        known = waiting.get(key)
+        waiting[key] = each if known is None else known.joined(each)
+    yield from waiting.values()
+
+
+def slots_at(bag: Bag, time: int) -> list[SlotTable]:
+    """Return the owners of the slots of each bus at an instant (UTC, ns), as they were recorded last."""
+    tables: dict[str, SlotTable] = {}
+    for each in bag.messages(SLOTS, SlotTable, start=time - _BASELINE, end=time + 1):
+        tables[each.message.bus] = each.message
+    return list(tables.values())
+
+
+# Events
+
+
+def _events(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+    for each in bag.messages(EVENTS, RecordedEvent, start=start, end=end):
+        event = each.message
+        word = event.kind.partition(" ")[0]
+        kind = _KIND_OF_EVENT.get(event.kind, word if word in KINDS else "notice")
+        subject = event.module or event.topic if kind in ("module", "notice") else event.link
+        yield Happening(time=each.log_time, kind=kind, about=subject or event.link, text=_event_text(event))
+
+
+def _event_text(event: RecordedEvent) -> str:
+    match event.kind:
+        case "link up":
+            text = f"up after {event.outage:.3g} s, {event.count} messages lost" if event.outage else "up"
+        case "link down" | "link waits":
+            text = event.kind.removeprefix("link ")
+        case "module found" | "module changed" | "module gone" | "module silent":
+            text = event.kind.removeprefix("module ")
+        case "master" | "no master" | "notice":
+            return event.text
+        case "events lost":
+            return f"{event.count} events came too fast"
+        case _:
+            text = event.kind
+    return f"{text}: {event.text}" if event.text else text
+
+
+# Misses, with the reasons that logs have
+
+
+def _misses(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+    reasons: dict[tuple[str, str], tuple[int, str]] = {}  # by module and topic: when it was logged, and what
+    logged = ((each.time, each) for each in _log(bag, start, end))
+    signals = ((each.log_time, each.message) for each in bag.messages(SIGNALS, RecordedSignal, start=start, end=end))
+    merged: Iterator[tuple[int, Happening | RecordedSignal]] = heapq.merge(logged, signals, key=itemgetter(0))
+    for time, each in merged:
+        if isinstance(each, RecordedSignal):
+            yield _signal(time, each, reasons)
+            continue
+        found = _LOGGED_MISS.search(each.text)
+        if found is not None:
+            reasons[each.about.partition("/")[0], found[1]] = time, found[2]
+        yield each
+
+
+def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tuple[int, str]]) -> Happening:
+    owner = f"{signal.module}/{signal.node}" if signal.node else signal.module
+    about = f"{signal.topic} of {owner}" if signal.topic else f"link {signal.where} of {owner}"
+    text = signal.reason
+    if signal.source == "statistics" and not text:
+        logged_at, reason = reasons.get((module_alias(signal.module.rpartition("/")[2]), signal.topic), (0, ""))
+        text = f"{reason}, as it logged" if reason and time - logged_at <= 2 * _TOGETHER else "as it counted"
+    elif signal.where and signal.topic:
+        text = f"{text} ({signal.where})"
+    return Happening(
+        time=time,
+        kind=signal.kind if signal.kind in KINDS else "notice",
+        about=about,
+        text=text,
+        count=signal.count,
+        late=signal.late,
+        sequence=signal.sequence,
+    )
+
+
+def _log(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+    topics = [name for name in bag.topics if name == LOG or name.endswith(f"/{LOG}")]
+    for recorded in bag.records(topics, start=start, end=end) if topics else ():
+        try:
+            record = Log.decode(recorded.sample.data)
+        except DecodeError:
+            continue  # another program uses the name
+        if record.level >= logging.WARNING:
+            about = "/".join(filter(None, (record.module, record.node)))
+            text = f"{logging.getLevelName(record.level)}: {record.text}"
+            yield Happening(time=recorded.log_time, kind="log", about=about, text=text)
+
+
+def _overdue(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+    """Yield the messages that came after their deadline; by the clock of the recorder, where that is known."""
+    for each in bag.raw(lambda channel: channel.kind == "meta", start=start, end=end):
+        info = each.channel.info
+        try:
+            meta = cdr(SampleMeta).decode(each.data)
+        except DecodeError:
+            continue
+        due = meta.expires or meta.deadline
+        if info is not None and 0 < due < each.log_time:
+            owner = "/".join(filter(None, (info.module, info.node)))
+            yield Happening(
+                time=each.log_time,
+                kind="overdue",
+                about=f"{info.topic} of {owner}" if owner else info.topic,
+                text="received after its deadline",
+                late=(each.log_time - due) / SECOND,
+                sequence=meta.number or (each.sequence if info.numbered else 0),
+            )
+
+
+# Changes
+
+
+def _slots(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+    before: dict[str, dict[tuple[str, str], SlotOwner]] = {}
+    for each in bag.messages(SLOTS, SlotTable, start=start - _BASELINE, end=end):
+        table = each.message
+        owners = {(owner.topic, owner.module): owner for owner in table.owners if owner.topic != "sync"}
+        known = before.get(table.bus)
+        before[table.bus] = owners
+        if known is None or each.log_time < start:
+            continue
+        for key in sorted(known.keys() | owners.keys()):
+            text = _slots_text(known.get(key), owners.get(key))
+            if text:
+                about = f"{key[0]} of {key[1]}" if key[0] else "unused slots"
+                yield Happening(time=each.log_time, kind="slots", about=about, text=f"{text} on {table.bus}")
+
+
+def _slots_text(before: SlotOwner | None, after: SlotOwner | None) -> str:
+    if after is None:
+        return "" if before is None else f"has lost {_numbers(before)}"
+    if before is None:
+        return f"has {_numbers(after)}"
+    return f"has {_numbers(after)} instead of {_numbers(before)}" if before.slots != after.slots else ""
+
+
+def _numbers(owner: SlotOwner) -> str:
+    return f"slot{'' if len(owner.slots) == 1 else 's'} {', '.join(map(str, owner.slots))}"
+
+
+def _parameters(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+    values: dict[tuple[str, str, str], ParameterValue] = {}
+    for each in bag.messages(PARAMETERS, ParameterValue, end=end):
+        new = each.message
+        key = new.module, new.node, new.name
+        before, values[key] = values.get(key), new
+        if before is None or each.log_time < start or (before.value, before.gone) == (new.value, new.gone):
+            continue
+        text = "gone" if new.gone else f"{f'{new.value} {new.unit}'.rstrip()}, was {before.value} ({new.origin})"
+        about = f"{new.module}/{new.node}.{new.name}"
+        yield Happening(time=each.log_time, kind="parameter", about=about, text=text)
+
+
+def _recorder(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+    """Yield what the recorder lost; its messages have totals."""
+    before: dict[str, tuple[int, int]] = {}
+    for each in bag.messages(f"{OWN_PREFIX}recorder", end=end):
+        for topic in each.message.topics:
+            dropped, missed = before.get(topic.topic, (0, 0))
+            before[topic.topic] = topic.dropped, topic.missed
+            grown = {
+                "dropped, as the disk was too slow or full": topic.dropped - dropped,
+                "lost on their way to the recorder": topic.missed - missed,
+            }
+            for text, count in grown.items():
+                if count > 0 and each.log_time >= start:
+                    yield Happening(time=each.log_time, kind="recorder", about=topic.topic, text=text, count=count)

@@ -1,0 +1,73 @@
+"""`r2p bag events` and `r2p bag slots`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from r2p.msg import Led
+from r2p.recording.entries import MessageEntry
+from r2p.tools.main import app
+from tests.recording.test_timeline import START, bag_of, path, utc
+
+__all__ = ["path", "utc"]  # fixtures
+
+
+def called(command: str, *arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, ["bag", command, *map(str, arguments)])
+
+
+def rows(result: Result) -> list[dict[str, Any]]:
+    assert result.exit_code == 0, result.stderr
+    return [json.loads(line) for line in result.stdout.splitlines()]
+
+
+def test_a_window_by_the_time_of_day(path: Path) -> None:
+    result = called("events", path, "--start", "22:13:35.1", "--end", "22:13:37")
+    assert [each["kind"] for each in rows(result)] == ["overdue", "master", "master", *["slots"] * 3]
+    assert rows(result)[0] == {
+        "stamp": START + 15_100_000_000,
+        "kind": "overdue",
+        "about": "leds of ARM/blink",
+        "text": "received after its deadline",
+        "count": 1,
+        "late": 0.0032,
+        "sequence": 8,
+    }
+    assert "from 2023-11-14 22:13:35.100 to 22:13:37.000: 1 overdue" in " ".join(result.stderr.split())
+
+
+def test_only_what_is_asked_for(path: Path) -> None:
+    result = called("events", path, "--only", "misses", "--start", "12", "--end", "14")
+    assert [each["sequence"] for each in rows(result)] == [1, 2, 3, 4, 0, 9]
+    assert "5 missed, 1 degraded" in " ".join(result.stderr.split())
+    wrong = called("events", path, "--only", "deadline")
+    assert wrong.exit_code == 2
+    assert "--only deadline: choose of misses, link, module" in " ".join(wrong.stderr.split())
+
+
+def test_nothing_happened_or_nothing_is_known(path: Path, tmp_path: Path) -> None:
+    quiet = called("events", path, "--start", "2", "--end", "5")
+    assert (quiet.exit_code, quiet.stdout) == (0, "")
+    assert "nothing from 2023-11-14 22:13:22.000 to 22:13:25.000" in " ".join(quiet.stderr.split())
+    bare = bag_of(tmp_path / "bare.mcap", [MessageEntry("/leds", Led(), START)])
+    assert "has only messages" in " ".join(called("events", bare).stderr.split())
+    missing = called("events", tmp_path / "none.mcap")
+    assert missing.exit_code != 0
+    assert "none.mcap" in missing.stderr
+
+
+@pytest.mark.parametrize(("at", "owner"), [("22:13:33", [3, 33]), ("-1s", [4])])
+def test_who_owned_which_slot(path: Path, at: str, owner: list[int]) -> None:
+    result = called("slots", path, "--at", at)
+    found = {each["topic"]: each for each in rows(result)}
+    assert found["encoder"] == {"bus": "rtcan:can0", "slots": owner, "topic": "encoder", "module": "BOSS"}
+    assert "60 slots in a cycle of 10 ms; the master is " in " ".join(result.stderr.split())
+
+
+def test_slots_at_a_time_outside_of_the_recording(path: Path) -> None:
+    result = called("slots", path, "--at", "1h")
+    assert result.exit_code == 2
+    assert "--at 1h: the recording is from 2023-11-14 22:13:20.000 to" in " ".join(result.stderr.split())
