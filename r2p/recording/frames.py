@@ -31,6 +31,8 @@ from r2p.ros.cdr import HEADER as CDR_HEADER
 from r2p.units import SECOND
 
 FRAME_TYPE = "can_msgs/msg/Frame"
+STANDARD_MASK = 0x7FF
+"""The identifiers of 11 bits."""
 
 _FRAME_MEMORY = 200  # bytes of a WireFrame, about
 _SENDERS_MAX = 64
@@ -41,7 +43,6 @@ _KINDS = tuple(bytes((kind >> 1 & 1, kind >> 2, kind & 1)) for kind in range(8))
 """The three flags of a frame, each a byte of can_msgs/Frame, by the highest three bits of its identifier."""
 
 _KIND_SHIFT = 29
-_STANDARD_MASK = 0x7FF
 _LENGTH_MAX = 15  # in the length field of a frame; only remote frames have more than 8 there
 _TIME = struct.Struct("<iII")
 _REST = struct.Struct("<I???B8s")
@@ -240,11 +241,33 @@ def frame_of(data: bytes, bus: str, *, sent: bool = False) -> RecordedFrame:
         identifier, remote, extended, error, size, content = _REST.unpack_from(data, at + -length % 4)
     except struct.error as problem:
         raise DecodeError(f"not a can_msgs/Frame: {problem}") from None
-    longest = _LENGTH_MAX if remote else FRAME_MAX
-    if not data.startswith(CDR_HEADER[:2]) or identifier > IDENTIFIER_MASK or size > longest:
-        raise DecodeError(f"not a can_msgs/Frame of CAN 2.0: identifier {identifier:#x}, {size} bytes")
-    if not (extended or error) and identifier > _STANDARD_MASK:
-        raise DecodeError(f"an identifier of 11 bits is not {identifier:#x}")
-    time = seconds * SECOND + rest
-    kept = b"" if remote else content[:size]
-    return RecordedFrame(time, bus, identifier, kept, extended, size if remote else None, error, sent)
+    if not data.startswith(CDR_HEADER[:2]):
+        raise DecodeError("not a can_msgs/Frame in little-endian CDR")
+    found = RecordedFrame(
+        seconds * SECOND + rest,
+        bus,
+        identifier,
+        b"" if remote else content[:size],
+        extended,
+        size if remote else None,
+        error,
+        sent,
+    )
+    return _checked(found, size)
+
+
+def frame_of_message(message: CanFrame, bus: str, *, sent: bool = False) -> RecordedFrame:
+    """Return the frame of a message. Raises DecodeError for one that is not of CAN 2.0."""
+    size = message.dlc
+    data, remote = (b"", size) if message.is_rtr else (message.data[:size], None)
+    stamp = message.header.stamp.ns
+    found = RecordedFrame(stamp, bus, message.id, data, message.is_extended, remote, message.is_error, sent)
+    return _checked(found, size)
+
+
+def _checked(frame: RecordedFrame, size: int) -> RecordedFrame:
+    longest = FRAME_MAX if frame.remote is None else _LENGTH_MAX
+    highest = IDENTIFIER_MASK if frame.extended or frame.error else STANDARD_MASK
+    if frame.id > highest or size > longest:
+        raise DecodeError(f"not a frame of CAN 2.0: identifier {frame.id:#x}, {size} bytes")
+    return frame

@@ -6,6 +6,8 @@ format is a module with two functions, `read` and `open_sink`, and is imported w
     bags        our own recordings, and MCAP files of others
     rosbag1     ROS 1
     rosbag2     ROS 2: a directory with metadata.yaml, or a database of SQLite
+    candump     logs of CAN frames, as text
+    can_files   CAN frames in BLF and ASC, by python-can
     csv_tables  CSV, a table for each topic
     parquet     Parquet, a table for each topic, in the types of Apache Arrow
 

@@ -64,6 +64,9 @@ FORMATS = {
         Format("rosbag1", (".bag",), f"{_HERE}.rosbag1", version=1, extra="ros"),
         Format("rosbag2", (".mcap", ".db3", ".yaml"), f"{_HERE}.rosbag2", is_folder=True, is_file=False, extra="ros"),
         Format("db3", (".db3",), f"{_HERE}.rosbag2", extra="ros"),
+        Format("candump", (".log",), f"{_HERE}.candump"),
+        Format("blf", (".blf",), f"{_HERE}.can_files", extra="can"),
+        Format("asc", (".asc",), f"{_HERE}.can_files", extra="can"),
         Format("csv", (".csv",), f"{_HERE}.csv_tables", is_folder=True),
         Format("parquet", (".parquet",), f"{_HERE}.parquet", is_folder=True, extra="parquet"),
     )
