@@ -33,12 +33,23 @@ from r2p.units import SECOND
 CAN_SCHEMES = ("rtcan:", "sim:")
 """How the URLs of CAN buses begin."""
 
+_SHARED = ("socketcan", "socketcand", "udp_multicast", "virtual")  # interfaces that several programs can open
+
 Put = Callable[[list[Entry]], object]
 """Gets what is to be written; it does not wait."""
 
 _SENDERS_MAX = 64
 _BATCH_S = 0.05  # seconds in which the frames of a simulated bus are collected
 _BATCH = 512  # frames after which they are handed on at once
+
+
+def is_shareable(via: str) -> bool:
+    """Return whether a module of this program can use the bus of a URL while its frames are recorded.
+
+    An adapter with a driver of its own, such as slcan, is opened once.
+    """
+    interface, colon, _ = parse(via).address.partition(":")
+    return via.startswith("sim:") or not colon or interface in _SHARED
 
 
 class FrameRecorder:

@@ -157,12 +157,16 @@ class Recorder:
         return "" if self._disk is None else self._disk.stopped
 
     def counts(self) -> dict[str, TopicCount]:
-        """Return what was received and lost so far, by topic. Raises Closed before the recorder was started."""
+        """Return what was received and lost so far, by topic. Raises Closed before the recorder was started.
+
+        Other channels, such as `/can0/frames`, are there if the disk was too slow for them.
+        """
         dropped = self._opened.lost
-        return {
-            name: TopicCount(topic.messages + topic.rejected, dropped.get(name, 0) + topic.rejected, topic.missed)
-            for name, topic in sorted(self._topics.items())
-        }
+        counts = {name: TopicCount(lost, lost) for name, lost in dropped.items()}
+        for name, topic in self._topics.items():
+            lost = dropped.get(name, 0) + topic.rejected
+            counts[name] = TopicCount(topic.messages + topic.rejected, lost, topic.missed)
+        return dict(sorted(counts.items()))
 
     async def wait(self) -> None:
         """Wait until the recording ends by itself: at a limit, or as the disk is full. `stopped` says why."""

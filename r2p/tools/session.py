@@ -50,6 +50,8 @@ Opening = Callable[[Settings], contextlib.AbstractAsyncContextManager[Any]]
 """Opens what a command works on instead of a Session."""
 Endless = Callable[[Mapping[str, Any]], bool]
 """Says of the arguments and options of a command whether it goes on until a signal ends it."""
+Joins = Callable[[Mapping[str, Any]], bool]
+"""Says of the arguments and options of a command whether it joins the network."""
 Run = Callable[[Callable[[], Coroutine[Any, Any, None]]], object]
 """Runs the main function of a command."""
 Check = Callable[[Settings, Mapping[str, Any]], object]
@@ -340,15 +342,21 @@ async def _idle(node: r2p.Node) -> None:
 
 
 @contextlib.asynccontextmanager
-async def join(settings: Settings, *, name: str = "tool", verbose: int = 0) -> AsyncIterator[Session]:
-    """Join the network as an observer, a module named `_` and six random characters; `name` is that of its node."""
+async def join(
+    settings: Settings, *, name: str = "tool", verbose: int = 0, alone: bool = False
+) -> AsyncIterator[Session]:
+    """Join the network as an observer, a module named `_` and six random characters; `name` is that of its node.
+
+    `alone`: open no link, whatever the settings have.
+    """
     if not settings.via:
         notify("no network: this tool sees only itself; give --via tcp:HOST:PORT or set R2P_VIA")
     alphabet = string.ascii_lowercase + string.digits
     check_urls(settings.via, settings.via_source)
     module_name = "_" + "".join(random_of(asyncio.get_running_loop()).choices(alphabet, k=6))
     aliases = settings.aliases
-    async with r2p.Module(module_name, via=settings.via, aliases=aliases, observer=True, watchdog=False) as module:
+    via = [] if alone else settings.via
+    async with r2p.Module(module_name, via=via, aliases=aliases, observer=True, watchdog=False) as module:
         yield Session(module, settings, name=name, verbose=verbose)
 
 
@@ -372,6 +380,7 @@ def command(
     opening: Opening | None = None,
     endless: Endless = counts_without_end,
     check: Check | None = None,
+    joins: Joins = lambda _given: True,
     takes_numbers: bool = False,
 ) -> Callable[[B], B]:
     """Make a command of `app` from the coroutine function that this decorates, and return the function unchanged.
@@ -382,7 +391,9 @@ def command(
     context = {"ignore_unknown_options": True} if takes_numbers else None
 
     def register(body: B) -> B:
-        app.command(name, context_settings=context)(joined(body, opening=opening, endless=endless, check=check))
+        app.command(name, context_settings=context)(
+            joined(body, opening=opening, endless=endless, check=check, joins=joins)
+        )
         return body
 
     return register
@@ -395,11 +406,13 @@ def joined(
     endless: Endless = counts_without_end,
     keep_trying: bool = False,
     check: Check | None = None,
+    joins: Joins = lambda _given: True,
 ) -> Callable[..., None]:
     """Make a command for `main.COMMANDS` of a coroutine function that takes a Session, or what `opening` opens.
 
     `check` comes before any link is opened, whose warnings would stand above its error.
-    Unless it is to `keep_trying`, the command fails as soon as no link can come up.
+    Unless it is to `keep_trying`, the command fails as soon as no link can come up. Where it does not join (`joins`),
+    its session has no links.
     """
     node = body.__name__.strip("_")
 
@@ -409,7 +422,13 @@ def joined(
             _check_count(given)
             if check is not None:
                 check(chosen, given)
-            async with join(chosen, name=node, verbose=verbose) if opening is None else opening(chosen) as opened:
+            if opening is None:
+                opens: contextlib.AbstractAsyncContextManager[Any] = join(
+                    chosen, name=node, verbose=verbose, alone=not joins(given)
+                )
+            else:
+                opens = opening(chosen)
+            async with opens as opened:
                 if opening is not None or keep_trying:
                     await body(opened, **given)
                 else:

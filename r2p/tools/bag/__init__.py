@@ -9,7 +9,7 @@ from r2p.tools.bag import convert, events, frames, record
 from r2p.tools.bag.recover import recover
 
 app = session.group("Record topics to a file, and play, inspect and convert it.")
-session.command(app, "record", endless=lambda _given: True, check=record.check)(record.record)
+session.command(app, "record", endless=lambda _given: True, check=record.check, joins=record.has_topics)(record.record)
 app.command("frames")(session.standalone(frames.frames))
 app.command("convert")(session.standalone(convert.convert))
 app.command("recover")(session.standalone(recover))

@@ -28,6 +28,8 @@ from r2p.units import SECOND
 
 if TYPE_CHECKING:
     from r2p.recording.disk import RecordingOptions
+    from r2p.recording.entries import BagEntry
+    from r2p.recording.frame_recorder import FrameRecorder
     from r2p.recording.recorder import Part, Recorder
 
 SNAPSHOT_SERVICE = "bag/snapshot"
@@ -49,12 +51,29 @@ def check(settings: Settings, given: Mapping[str, Any]) -> None:
             topic_pattern(each.removeprefix("/"), option)
     if given["frames"] and not _buses(settings):
         raise UsageError("--frames records the CAN buses of --via: give --via rtcan:can0 (or a sim: URL)")
+    if given["frames"] and has_topics(given):
+        _check_buses(settings)
     _stated_types(settings, given["topics"], given["type"])
     _options({name: given[name] for name in _LIMITS})
     output = given["output"]
     if output is not None and (output.exists() or not output.parent.is_dir()):
         reason = "exists, and is never overwritten: give another" if output.exists() else "is in no directory: give an"
         raise UsageError(f"{output} {reason} -o FILE")
+
+
+def has_topics(given: Mapping[str, Any]) -> bool:
+    """Return whether topics are recorded: else nothing is sent to the network, on which RTCAN may not be spoken."""
+    return bool(given["topics"] or given["all"])
+
+
+def _check_buses(settings: Settings) -> None:
+    from r2p.recording.frame_recorder import is_shareable  # only here, as it takes a while
+
+    for url in _buses(settings):
+        if not is_shareable(url):
+            raise UsageError(
+                f"{url} can be opened once: record its frames without topics, or its topics without frames"
+            )
 
 
 _Topics = Annotated[
@@ -111,6 +130,7 @@ async def record(
     from r2p.recording.recorder import Recorder  # only here, as it takes a while
 
     limits = (max_size, max_duration, split, snapshot, min_free, max_total)
+    buses: list[FrameRecorder] = []
     recorder = Recorder(
         session.module,
         output or Path(local_time(session.module.space.clock.now(), "r2p-%Y%m%d-%H%M%S.mcap")),
@@ -118,12 +138,14 @@ async def record(
         exclude=exclude or (),
         types=_stated_types(session.settings, topics, type),
         options=_options(dict(zip(_LIMITS, limits, strict=True))),
-        parts=_parts(session.settings, frames=frames),
+        parts=_parts(session.settings, buses if frames else None),
     )
-    await _record(session, recorder, Output(format), topics or [])
+    await _record(session, recorder, Output(format), topics or [], buses)
 
 
-async def _record(session: Session, recorder: "Recorder", output: Output, topics: list[str]) -> None:
+async def _record(
+    session: Session, recorder: "Recorder", output: Output, topics: list[str], buses: "list[FrameRecorder]"
+) -> None:
     clock = session.module.space.clock
     began = clock.monotonic()
     try:
@@ -134,14 +156,19 @@ async def _record(session: Session, recorder: "Recorder", output: Output, topics
         raise r2p.Error(f"can't write {recorder.path}: {error.strerror}") from error
     finally:
         if recorder.started:
-            await _print_summary(recorder, output, (clock.monotonic() - began) / SECOND)
+            await _print_summary(recorder, buses, output, (clock.monotonic() - began) / SECOND)
     if not recorder.stopped.startswith("max_"):
         raise r2p.Error(f"the recording has ended early: {recorder.stopped}")
 
 
-async def _print_summary(recorder: "Recorder", output: Output, seconds: float) -> None:
-    """Print what was recorded and lost, by topic."""
+async def _print_summary(recorder: "Recorder", buses: "list[FrameRecorder]", output: Output, seconds: float) -> None:
+    """Print what was recorded and lost, by topic and bus."""
+    from r2p.recording.recorder import TopicCount
+
     counts = recorder.counts()
+    for each in buses:
+        dropped = counts.get(each.bus.topic, TopicCount()).dropped
+        counts[each.bus.topic] = TopicCount(each.frames, dropped, each.lost.total())
     total = sum(each.messages - each.dropped for each in counts.values())
     files = ", ".join(map(str, recorder.paths)) or "no file"
     notify(f"{total} messages in {seconds:.1f} s, {recorder.bytes_written / 1e6:.1f} MB: {files}")
@@ -159,7 +186,7 @@ def _hints(session: Session, topics: list[str]) -> Iterator[None]:
         for name in names:
             if not any(fnmatchcase(each, name) for each, view in views.items() if is_published(view)):
                 notify(f"{name} has no publisher yet{suggest_topics(session, name, is_published)}")
-        if not names and not any(map(is_published, views.values())):
+        if not names and session.module.links and not any(map(is_published, views.values())):
             notify(session.none_yet("topics"))
 
     with call_after(HINT_AFTER, report):
@@ -219,8 +246,11 @@ def _buses(settings: Settings) -> list[str]:
     return [url for url in settings.via if url.startswith(CAN_SCHEMES)]
 
 
-def _parts(settings: Settings, *, frames: bool) -> "list[Part]":
-    """Return what is recorded besides topics: what happens on the network, r2p.toml, and frames."""
+def _parts(settings: Settings, buses: "list[FrameRecorder] | None") -> "list[Part]":
+    """Return what is recorded besides topics: what happens on the network, r2p.toml, and frames.
+
+    The recorders of frames enter `buses`; None: no frames.
+    """
     from r2p.recording.frame_recorder import FrameRecorder  # only here, as it takes a while
     from r2p.recording.observations import Observations
 
@@ -228,10 +258,16 @@ def _parts(settings: Settings, *, frames: bool) -> "list[Part]":
     files = {} if file is None else {file.name: ("application/toml", file.read_bytes())}
 
     def of_bus(url: str) -> "Part":
-        return lambda _module, add: FrameRecorder(url, lambda entries: [add(each) for each in entries], report=notify)
+        def begin(_module: r2p.Module, add: "Callable[[BagEntry], object]") -> FrameRecorder:
+            assert buses is not None
+            recorder = FrameRecorder(url, lambda entries: [add(each) for each in entries], report=notify)
+            buses.append(recorder)
+            return recorder
+
+        return begin
 
     observations: Part = functools.partial(Observations, files=files)
-    return [observations, *(of_bus(url) for url in _buses(settings) if frames)]
+    return [observations, *(of_bus(url) for url in _buses(settings) if buses is not None)]
 
 
 def _options(limits: Mapping[str, Any]) -> "RecordingOptions":

@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import typer
 
+from r2p.codecs.can_bits import Frame
 from r2p.msg import Led
 from r2p.recording.bag import Bag
+from r2p.recording.frame_reader import BusReader
 from r2p.ros.std_srvs import Trigger
-from r2p.tools.bag.record import SNAPSHOT_SERVICE, check, record
+from r2p.sim.can import CanNode
+from r2p.sim.transport import can_bus
+from r2p.tools.bag.record import SNAPSHOT_SERVICE, check, has_topics, record
 from r2p.tools.options import byte_size, long_seconds
-from r2p.tools.session import Settings, UsageError
+from r2p.tools.session import Settings, UsageError, join
 from tests.tools.rig import PUBLISH, listening, printed, process, robot, tool
 
 if TYPE_CHECKING:
@@ -66,6 +70,31 @@ async def test_all_topics_are_recorded_until_a_signal(tmp_path: Path, capsys: py
     assert recorded == list(range(recorded[0], recorded[0] + len(recorded)))
     assert len(recorded) >= 15
     assert printed(capsys)[0] == {"topic": "leds", "messages": len(recorded), "dropped": 0, "missed": 0}
+
+
+@pytest.mark.virtual_time
+async def test_frames_alone_are_recorded_without_joining_the_bus(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, bus = tmp_path / "one.mcap", can_bus("lab")
+    a, _ = (bus.bus.attach(CanNode(name)) for name in "AB")
+    settings = Settings(via=["sim:lab"])
+    given = GIVEN | {"frames": True}
+    check(settings, given)
+    async with join(settings, alone=not has_topics(given)) as session, recording(session, frames=True, output=path):
+        await asyncio.sleep(1.0)
+        a.request(Frame(0x123, b"abc"))
+        await asyncio.sleep(1.0)
+    with Bag(path) as bag:
+        assert [(each.id, each.data) for each in BusReader(bag).read("lab")] == [(0x123, b"abc")]
+    assert printed(capsys) == [{"topic": "/lab/frames", "messages": 1, "dropped": 0, "missed": 0}]
+
+
+def test_an_adapter_that_can_be_opened_once_is_not_for_both() -> None:
+    settings = Settings(via=["rtcan:slcan:/dev/ttyACM0"])
+    check(settings, GIVEN | {"frames": True})
+    with pytest.raises(UsageError, match="can be opened once"):
+        check(settings, GIVEN | {"frames": True, "all": True})
 
 
 @pytest.mark.virtual_time
