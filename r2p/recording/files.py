@@ -4,7 +4,7 @@ import contextlib
 import errno
 import os
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -190,7 +190,11 @@ class RecordingFiles:
     def _over(self, chunk: PackedChunk) -> bool:
         file, limit = self._file, self._options.file_size
         assert file is not None
-        return bool(limit) and file.has_messages and file.size + file.summary_size + 2 * chunk.size > limit
+        return (
+            bool(limit)
+            and file.has_messages
+            and file.size + chunk.size + file.summary_size + chunk.summary_size > limit
+        )
 
     def _limit_reached(self, limit: str) -> None:
         if self._options.split and not self.stopped:
@@ -278,9 +282,17 @@ class RecordingFiles:
                     raise
             if self._delete_oldest():
                 continue
-            lost = file.drop_last_chunk()
-            self._count_lost(lost)
-            self._report(f"the disk is full: the last {sum(lost.values())} messages made room for the end of the file")
+            self._give_up(file.drop_last_chunk())
+
+    def _give_up(self, chunk: PackedChunk | None) -> None:
+        """Leave a chunk, which made room for the end of its file, to the next file; if there is none, it is lost."""
+        if chunk is None:
+            return
+        if self._options.split and not self.stopped:
+            self.writer.ready.appendleft(chunk)
+            return
+        count = self._count_lost(chunk)
+        self._report(f"the disk is full: the last {count} messages made room for the end of the file")
 
     # What goes wrong
 
@@ -308,21 +320,21 @@ class RecordingFiles:
     def fail(self, why: str) -> None:
         """End the recording with a file that can be read, as nothing more can be written."""
         self.stopped, self._failed = why, True
-        before = self.lost.total()
         self.writer.end_chunk()
-        for item in self.writer.ready:
-            if isinstance(item, PackedChunk):
-                self._count_lost({channel: part.count for channel, part in item.channels.items()})
+        lost = sum(self._count_lost(item) for item in self.writer.ready if isinstance(item, PackedChunk))
         self.writer.ready.clear()
         self._finish_file()
-        lost = self.lost.total() - before
-        self._report(f"the recording ended: {why}" + (f"; its last {lost} messages are lost" if lost else ""))
+        self._report(f"the recording ended: {why}" + (f"; the last {lost} messages are lost" if lost else ""))
 
-    def _count_lost(self, counts: Mapping[int, int]) -> None:
-        for channel, count in counts.items():
+    def _count_lost(self, chunk: PackedChunk) -> int:
+        """Count the messages of a chunk that is in no file, and return how many they are."""
+        total = 0
+        for channel, part in chunk.channels.items():
             about = self.writer.channels[channel]
             if not about.topic.startswith(META_PREFIX):
-                self.lost[about.metadata.get("topic", about.topic)] += count
+                self.lost[about.metadata.get("topic", about.topic)] += part.count
+                total += part.count
+        return total
 
     def _free(self) -> int:
         found = os.statvfs(self.path.parent)

@@ -5,6 +5,7 @@ Schemas and channels stand before the chunks, not in them, so a chunk holds noth
 """
 
 import contextlib
+import io
 import struct
 import zlib
 from collections import Counter
@@ -12,7 +13,7 @@ from collections.abc import Iterator
 from typing import BinaryIO, Self
 
 import msgspec
-from mcap.data_stream import RecordBuilder
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -43,6 +44,8 @@ RECORD = struct.Struct("<BQ")
 
 _INDEX = struct.Struct("<BQHI")  # before a channel's pairs (log time, offset), 16 bytes each
 _PAIR = 16
+_LINE_SIZE = RECORD.size + 64  # bytes of a chunk in the summary, without its channels and its compression
+_PER_CHANNEL = 10  # bytes of a number of a channel
 _FOOTER_IN_CRC = struct.Struct("<BQQQ")
 _GROUPS = Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX
 
@@ -92,6 +95,11 @@ class PackedChunk(msgspec.Struct, frozen=True):
             chunk.uncompressed_size,
             dict(_channels(index)),
         )
+
+    @property
+    def summary_size(self) -> int:
+        """Bytes of its line in a summary, and of the counts of its channels there, at the most."""
+        return _LINE_SIZE + len(self.compression) + 2 * _PER_CHANNEL * len(self.channels)
 
     def summary(self, position: int) -> ChunkIndex:
         """Return what the summary of a file says of this chunk, at this position."""
@@ -181,7 +189,7 @@ class McapFile:
         return data
 
     def _enter(self, position: int, crc: int, line: bytes, chunk: PackedChunk | None = None) -> None:
-        self.summary_size += len(line) + 10 * len(chunk.channels if chunk else ())
+        self.summary_size += len(line) if chunk is None else chunk.summary_size
         times = (chunk.start, chunk.end) if chunk else ()
         self._written.append(_Written(position, crc, line[0], line, *times))
 
@@ -239,29 +247,27 @@ class McapFile:
         chunks = [item for item in self._written if item.opcode == Opcode.CHUNK_INDEX]
         return min((item.start for item in chunks), default=0), max((item.end for item in chunks), default=0)
 
-    def drop_last_chunk(self) -> dict[int, int]:
-        """Cut the last chunk off, to make room for the summary, and all that stands behind it.
-
-        Returns how many messages of each channel are lost by that; none if there was no chunk.
-        """
+    def drop_last_chunk(self) -> PackedChunk | None:
+        """Cut the last chunk off, to make room for the summary, and all behind it; return it, None if there is none."""
         while self._written:
             item = self._written.pop()
-            counts = self._counts_of(item.position) if item.opcode == Opcode.CHUNK_INDEX else {}
+            chunk = self._read_back(item.position) if item.opcode == Opcode.CHUNK_INDEX else None
             self.size, self._crc = item.position, item.crc
             self._file.seek(self.size)
             self._file.truncate()
-            if counts:
-                self._counts.subtract(counts)
+            if chunk is not None:
+                self._counts.subtract({channel: part.count for channel, part in chunk.channels.items()})
                 self._counts = +self._counts
-                return counts
-        return {}
+                return chunk
+        return None
 
-    def _counts_of(self, position: int) -> dict[int, int]:
-        """Return the number of messages of each channel in the last chunk."""
+    def _read_back(self, position: int) -> PackedChunk:
+        """Return the last chunk, which stands there."""
         self._file.seek(position)
         data = self._file.read(self.size - position)
         length = RECORD.size + RECORD.unpack_from(data)[1]
-        return {channel: part.count for channel, part in _channels(data[length:])}
+        chunk = Chunk.read(ReadDataStream(io.BytesIO(data[RECORD.size : length])))
+        return PackedChunk.make(chunk, data[length:])
 
     def _put(self, data: bytes) -> None:
         rest = memoryview(data)
