@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -66,6 +67,38 @@ def open_new(path: Path) -> BinaryIO:
     return path.open("xb+", buffering=0)
 
 
+class BackgroundSync:
+    """Brings what was written to the disk, in a thread of its own: an SD card may take seconds for it."""
+
+    def __init__(self, *, enabled: bool) -> None:
+        self._enabled = enabled
+        self._thread: threading.Thread | None = None
+        self._error: OSError | None = None
+
+    def start(self, file: BinaryIO) -> None:
+        """Begin with a file, unless the last time still goes on. Raises the OSError of the last time."""
+        if not self._enabled or (self._thread is not None and self._thread.is_alive()):
+            return
+        self.join()
+        self._thread = threading.Thread(target=self._run, args=(file.fileno(),), name="r2p-sync", daemon=True)
+        self._thread.start()
+
+    def join(self) -> None:
+        """Wait until the file is not used any more, and raise the OSError of the last time."""
+        if self._thread is not None:
+            self._thread.join()
+        self._thread = None
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _run(self, descriptor: int) -> None:
+        try:
+            os.fdatasync(descriptor)
+        except OSError as error:
+            self._error = error
+
+
 class RecordingFiles:
     """The files of a recording. All methods wait for the disk.
 
@@ -97,6 +130,7 @@ class RecordingFiles:
         self._sizes: dict[Path, int] = {}  # of finished files
         self._ring: deque[PackedChunk] = deque()
         self._ring_size = 0
+        self._syncing = BackgroundSync(enabled=not clock.virtual)
         self._failed = False
         self._began = clock.monotonic()
         self._chunk_due, self._sync_due = self._began + _CHUNK_EVERY, self._began + _SYNC_EVERY
@@ -156,7 +190,7 @@ class RecordingFiles:
         if self._raw is None:
             return
         try:
-            self._sync_file(self._raw)
+            self._syncing.start(self._raw)
             self._check_free()
         except OSError as error:
             self._on_error(error)
@@ -256,9 +290,10 @@ class RecordingFiles:
             return
         try:
             self._finish_with_room(file)
+            self._syncing.join()
             self._sync_file(raw)
         except OSError as error:
-            self._report(f"{self.paths[-1]} has no end ({error.strerror}): `r2p bag recover` makes it whole")
+            self._report(f"{self.paths[-1]} may not be whole ({error.strerror}): try `r2p bag recover`")
         finally:
             self._close(raw, file)
 
@@ -267,6 +302,8 @@ class RecordingFiles:
             os.fdatasync(raw.fileno())
 
     def _close(self, raw: BinaryIO, file: McapFile) -> None:
+        with contextlib.suppress(OSError):
+            self._syncing.join()
         with contextlib.suppress(OSError):
             raw.close()
         self.finished_bytes += file.size

@@ -2,6 +2,7 @@
 
 import asyncio
 import errno
+import functools
 import io
 import itertools
 import os
@@ -82,7 +83,7 @@ def test_under_virtual_time_the_same_run_writes_the_same_bytes(tmp_path: Path) -
 
     paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     for path in paths:
-        r2p.sim.run(lambda path=path: main(path))
+        r2p.sim.run(functools.partial(main, path))
     assert paths[0].read_bytes() == paths[1].read_bytes()
     assert sequences(*paths) == [*range(1, 101), *range(1, 101)]
 
@@ -229,7 +230,7 @@ async def test_a_disk_that_fails_leaves_a_file_to_recover(tmp_path: Path) -> Non
     await record(disk, 1_000)
     await disk.close()
     assert reports == [
-        f"{path} has no end (Input/output error): `r2p bag recover` makes it whole",
+        f"{path} may not be whole (Input/output error): try `r2p bag recover`",
         f"the recording ended: the disk failed: Input/output error; the last {disk_lost(reports)} messages are lost",
     ]
     report = recover(path, tmp_path / "new.mcap")
