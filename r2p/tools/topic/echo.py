@@ -4,28 +4,21 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
-from typing import Annotated, Any, TypeAlias
-
-import msgspec
-import typer
+from typing import Any
 
 import r2p
-from r2p.messages.values import META, Form, flatten, pick, to_plain
 from r2p.names import topic_name
 from r2p.tools.options import Count, Format, Once, Timeout
 from r2p.tools.output import Output, notify
 from r2p.tools.session import REPORT_WAITING_AFTER, Session, UsageError, patience
-from r2p.tools.topic.filter import Filter, FilterError
+from r2p.tools.topic.filter import FilterError
+from r2p.tools.topic.selection import Content, Fields, FilterText, Full, Meta, Selection, as_hex, filter_for, form_of
 from r2p.tools.topic.watching import Topics, TypeName, advice, received_samples, while_publishers_fit
 from r2p.tools.types import Types, suggestion
 from r2p.units import SECOND
 
 QUEUE = 1024
 """Messages that wait for a slow terminal or pipe; beyond that the oldest are lost, and counted."""
-
-_HEX = "data"  # the field of a message of unknown type
-
-_Content: TypeAlias = r2p.Message | dict[str, Any]
 
 logger = logging.getLogger("r2p.echo")
 
@@ -35,16 +28,10 @@ async def echo(
     topics: Topics,
     *,
     type: TypeName = None,
-    field: Annotated[
-        list[str] | None,
-        typer.Option("--field", metavar="PATH", help="Only this field: x, stamp.sec, value[0] (repeatable)."),
-    ] = None,
-    filter: Annotated[
-        str | None,
-        typer.Option("--filter", metavar="EXPR", help="Only messages for which it is true: 'x > 3 and abs(w) < 0.1'."),
-    ] = None,
-    full: Annotated[bool, typer.Option("--full", help="Print long arrays and texts whole at a terminal, too.")] = False,
-    meta: Annotated[bool, typer.Option("--meta", help="Add topic, stamp, source and sequence, under `_`.")] = False,
+    field: Fields = None,
+    filter: FilterText = None,
+    full: Full = False,
+    meta: Meta = False,
     count: Count = None,
     once: Once = False,
     timeout: Timeout = None,
@@ -60,8 +47,7 @@ async def echo(
     names = list(dict.fromkeys(map(topic_name, topics)))
     types = Types(session.settings)
     readers = [_TopicReader(session, name, types, type, filter) for name in names]
-    form: Form = "cells" if output.format == "csv" else "whole" if full or output.format == "json" else "short"
-    selection = _Selection(names, field or [], meta=meta, form=form)
+    selection = Selection(names, field or [], meta=meta, form=form_of(output, full=full))
     left = 1 if once else count
 
     async def print_all(reader: _TopicReader) -> None:
@@ -92,75 +78,11 @@ async def echo(
             reader.report()
 
 
-async def _print_header(
-    session: Session, output: Output, readers: "list[_TopicReader]", selection: "_Selection"
-) -> None:
+async def _print_header(session: Session, output: Output, readers: "list[_TopicReader]", selection: Selection) -> None:
     """Print the header of CSV with several topics, whose types must be known as far as possible."""
     if not all(each.typed for each in readers):
         await session.settle()
     await output.header([path for each in readers for path in await each.columns(selection)])
-
-
-class _Selection(msgspec.Struct):
-    """The printed part of a message: the `fields` that the user chose, in a `form`, and where it comes from.
-
-    A content of unknown type is a record with its bytes in hex. Of several `topics` only one needs to have a field:
-    `lacking` are the topics without it, by field.
-    """
-
-    topics: list[str]
-    fields: list[str]
-    meta: bool
-    form: Form
-    lacking: dict[str, set[str]] = {}
-
-    @property
-    def labelled(self) -> bool:
-        """True if a column names the topic of each row: CSV has one header for all topics."""
-        return self.form == "cells" and len(self.topics) > 1
-
-    def of(self, topic: str, content: _Content, sample: r2p.Sample | None) -> dict[str, Any]:
-        """Return the record to print. Raises UsageError for a field that no topic has."""
-        if self.fields:
-            record = self._chosen(topic, content)
-        else:
-            record = to_plain(content, self.form) if isinstance(content, r2p.Message) else content
-        return self.label(topic, record, sample)
-
-    def label(self, topic: str, row: dict[str, Any], sample: r2p.Sample | None) -> dict[str, Any]:
-        """Return a row with the topic, and with what else --meta adds."""
-        if self.labelled:
-            row = {"topic": topic} | {"topic_" if name == "topic" else name: value for name, value in row.items()}
-        if self.meta or (len(self.topics) > 1 and self.form != "cells"):
-            row[META] = _meta(topic, sample)
-        return row
-
-    def _chosen(self, topic: str, content: _Content) -> dict[str, Any]:
-        row = {}
-        for path in self.fields:
-            lacking = self.lacking.setdefault(path, set())
-            try:
-                row[path] = self._pick(content, path)
-                lacking.discard(topic)  # its type was not known before
-            except KeyError as error:
-                self._note_lacking(topic, path, lacking, error.args[0])
-        return row
-
-    def _pick(self, content: _Content, path: str) -> Any:
-        if isinstance(content, r2p.Message):
-            return pick(content, path, self.form)
-        if path not in content:
-            raise KeyError(f"there is no field {path}; the fields are {', '.join(content)}")
-        return content[path]
-
-    def _note_lacking(self, topic: str, path: str, lacking: set[str], problem: str) -> None:
-        """Report once that a topic lacks a field. Raises UsageError if none of them has it."""
-        is_new = topic not in lacking
-        lacking.add(topic)
-        if len(lacking) == len(self.topics):
-            raise UsageError(problem if len(lacking) == 1 else f"no topic has a field {path}; of {topic}: {problem}")
-        if is_new:
-            notify(f"{topic} has no field {path}: left out there")
 
 
 class _TopicReader:
@@ -171,7 +93,7 @@ class _TopicReader:
         self._session = session
         self._types = types
         self._cls = types.stated(topic, given)
-        self._filter = _filter(filter, self._cls)
+        self._filter = filter_for(filter, self._cls)
         self._subscriber: r2p.Subscriber[Any] = session.node.subscribe(topic, self._cls, queue=QUEUE, lossy=True)
         self._next_look_up = 0  # ns
         self._reported = False  # that the type is unknown
@@ -181,7 +103,7 @@ class _TopicReader:
     def typed(self) -> bool:
         return self._cls is not None
 
-    async def messages(self) -> AsyncIterator[tuple[_Content, r2p.Sample]]:
+    async def messages(self) -> AsyncIterator[tuple[Content, r2p.Sample]]:
         """Yield each message that passes the filter, with its sample. Raises UsageError."""
         async for sample in received_samples(self._session, self._subscriber, typed=self.typed):
             message = self._decoded(sample)
@@ -189,21 +111,19 @@ class _TopicReader:
                 await self._look_up_type(sample)
                 message = self._decoded(sample)
             if self._passes(message):
-                yield {_HEX: sample.data.hex()} if message is None else message, sample
+                yield as_hex(sample.data) if message is None else message, sample
 
     def while_type_fits(self) -> AbstractAsyncContextManager[None]:
         """Raise r2p.Error in the block when all publishers have another type than the one stated."""
         return while_publishers_fit(self._session, self._subscriber, self._cls)
 
-    async def columns(self, selection: _Selection) -> list[str]:
+    async def columns(self, selection: Selection) -> list[str]:
         """Return the columns of CSV that the messages will have, as far as their type is known by now."""
         if not self.typed:
             await self._learn()
-        if self._cls is None:  # its messages are in hex, or have these fields once their type is known
-            return list(flatten(selection.label(self.topic, dict.fromkeys(selection.fields or [_HEX], ""), None)))
-        return list(flatten(selection.of(self.topic, r2p.layout(self._cls).zero, None)))
+        return selection.columns(self.topic, self._cls)
 
-    def check_fields(self, selection: _Selection) -> None:
+    def check_fields(self, selection: Selection) -> None:
         """Raise UsageError for a field that no topic has, as far as their types are known by now."""
         if self._cls is not None:
             selection.of(self.topic, r2p.layout(self._cls).zero, None)
@@ -265,32 +185,3 @@ class _TopicReader:
     async def _learn(self) -> None:
         view = self._session.module.network.topics().get(self.topic, r2p.TopicView(self.topic))
         self._cls = await self._types.learn(self._session, view)
-
-
-def _filter(text: str | None, cls: type[r2p.Message] | None) -> Filter | None:
-    """Return the filter of one topic, for its type if that is stated. Raises UsageError."""
-    if text is None:
-        return None
-    try:
-        made = Filter(text)
-        if cls is not None:
-            made.bind(cls)
-    except FilterError as error:
-        raise UsageError(str(error)) from error
-    return made
-
-
-def _meta(topic: str, sample: r2p.Sample | None) -> dict[str, Any]:
-    """Return where a message comes from; without a sample, only the keys."""
-    if sample is None:
-        return dict.fromkeys(("topic", "stamp", "stamp_from", "source", "sequence"))
-    meta = {
-        "topic": topic,
-        "stamp": sample.stamp,
-        "stamp_from": "sender" if sample.stamped else "reception",
-        "source": str(sample.source),
-        "sequence": sample.sequence or None,
-    }
-    if sample.clock is not None:
-        meta["clock"] = msgspec.to_builtins(sample.clock)
-    return meta
