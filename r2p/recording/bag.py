@@ -16,7 +16,7 @@ from r2p.errors import BagError, DecodeError, TypeMismatch
 from r2p.messages import Message
 from r2p.recording.bag_file import Attachment, BagFile, Paths, bag_paths
 from r2p.recording.channels import BagChannel, M
-from r2p.recording.format import CDR, METADATA, ChannelInfo
+from r2p.recording.format import CDR, LATCHED, METADATA, ChannelInfo
 from r2p.recording.messages import SampleMeta
 from r2p.recording.records import TIME_MAX, ChunkRef, RawMessage
 from r2p.recording.samples import sample_of
@@ -159,7 +159,20 @@ class Bag:
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records by name, without that of the format; the last of a name."""
-        return {name: values for each in self.files for name, values in each.metadata() if name != METADATA}
+        found: dict[str, dict[str, str]] = {}
+        for each in self.files:
+            in_file = {name: values for name, values in each.metadata() if name != METADATA}
+            latched = found.get(LATCHED, {}) | in_file.get(LATCHED, {})
+            found |= in_file | ({LATCHED: latched} if latched else {})
+        return found
+
+    @property
+    def latched(self) -> set[str]:
+        """The topics whose last message a late subscriber gets."""
+        return {
+            *self.metadata.get(LATCHED, ()),
+            *(each.info.topic for each in self.channels if each.info and each.is_latched),
+        }
 
     def attachments(self) -> Iterator[Attachment]:
         """Read the attachments that can be read; those that each part of a recording has, once."""

@@ -1,6 +1,7 @@
 """The channels of a bag, and the types of the messages on them."""
 
 import functools
+import re
 from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias, TypeVar
 
@@ -16,6 +17,8 @@ from r2p.ros.cdr import cdr
 from r2p.ros.transcoding import transcoder
 
 M = TypeVar("M", bound=Message)
+
+_LATCHED_IN_ROS = re.compile(r"durability:\s*(?:1\b|transient_local)")
 
 Kind: TypeAlias = Literal["samples", "meta", "messages"]
 """What is on a channel: samples of a topic, their companions, or other messages."""
@@ -87,6 +90,11 @@ class BagChannel(msgspec.Struct, eq=False, dict=True):
         if self.info is not None and self.info.type:
             return self.info.type
         return self.schema_name.replace("/msg/", "/")
+
+    @property
+    def is_latched(self) -> bool:
+        """Whether rosbag2 recorded the channel as one whose last message late subscribers get."""
+        return _LATCHED_IN_ROS.search(self.metadata.get("offered_qos_profiles", "")) is not None
 
     def plus(self, count: int) -> "BagChannel":
         """Return the channel with more messages, of another file."""

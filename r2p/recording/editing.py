@@ -22,7 +22,7 @@ from r2p.errors import BagError, DecodeError, MessageError
 from r2p.recording.bag import Bag, RawRecord
 from r2p.recording.bag_file import BagFile
 from r2p.recording.channels import BagChannel
-from r2p.recording.format import METADATA, OWN_PREFIX
+from r2p.recording.format import LATCHED, METADATA, OWN_PREFIX
 from r2p.recording.messages import SampleMeta
 from r2p.recording.records import TIME_MAX, ChunkRef, parse
 from r2p.recording.writer import ABOUT, BagWriter
@@ -79,15 +79,15 @@ def cut(
     start: int | None = None,
     end: int | None = None,
     wanted: Wanted | None = None,
-    keep_last: bool = False,
+    keep_latched: bool = False,
 ) -> Generator[Edited]:
     """Write what was recorded from `start` to `end` (UTC, ns; `end` not included) into a new file.
 
-    With `keep_last` it begins with the last message of each publisher before `start`, as if it were received then;
-    stamps stay. Raises BagError if the file exists, or can't be written.
+    With `keep_latched` it begins with the last message before `start` of each publisher of a latched topic, as if it
+    were received then; stamps stay. Raises BagError if the file exists, or can't be written.
     """
     with _NewFile(path) as file:
-        yield from _Cut(bag, _writer_for(file, [(bag, 0)]), start, end, wanted).run(keep_last=keep_last)
+        yield from _Cut(bag, _writer_for(file, [(bag, 0)]), start, end, wanted).run(keep_latched=keep_latched)
 
 
 class _NewFile:
@@ -140,8 +140,8 @@ class _Cut:
                     ids[number] = _add_channel(self._writer, channel)
         return ids
 
-    def run(self, *, keep_last: bool) -> Iterator[Edited]:
-        if keep_last:
+    def run(self, *, keep_latched: bool) -> Iterator[Edited]:
+        if keep_latched:
             self._add_last()
         start, end = self._span
         chunks = [(chunk, number) for number, file in enumerate(self._bag.files) for chunk in file.summary.chunks]
@@ -181,13 +181,13 @@ class _Cut:
             self._writer.add(ids[channel], log_time, publish_time, sequence, data)
 
     def _add_last(self) -> None:
-        """Write the last message of each publisher before the start, with its companion, at the start."""
+        """Write the last message of each latching publisher before the start, with its companion, at the start."""
         new = {
             file.channels[number]: id_there
             for file, ids in zip(self._bag.files, self._ids, strict=True)
             for number, id_there in ids.items()
         }
-        for last in self._bag.last_before(self._span[0]):
+        for last in self._bag.last_before(self._span[0], self._bag.latched):
             time, info = last.log_time, last.channel.info
             at_once = list(self._bag.raw(lambda each, info=info: each.info == info, start=time, end=time + 1))  # type: ignore[misc]
             sequence = next(each.sequence for each in reversed(at_once) if each.channel is last.channel)
@@ -253,12 +253,12 @@ def _writer_for(file: BinaryIO, bags: Sequence[tuple[Bag, int]]) -> BagWriter:
     """Begin a file with the metadata and attachments of all bags; it is one of r2p's if one of them is."""
     files = [each for bag, _ in bags for each in bag.files]
     writer = BagWriter(file, about=ABOUT if any(each.is_own for each in files) else {})
-    known = []
+    known = [(LATCHED, {name: value for bag, _ in bags for name, value in bag.metadata.get(LATCHED, {}).items()})]
     for each in files:
-        for record in each.metadata():
-            if record[0] != METADATA and record not in known:
-                known.append(record)
-                writer.add_metadata(*record)
+        known += [record for record in each.metadata() if record[0] not in {METADATA, LATCHED} and record not in known]
+    for record in known:
+        if record[1]:
+            writer.add_metadata(*record)
     attached: dict[str, bytes] = {}
     for bag, offset in bags:
         for attachment in bag.attachments():

@@ -1,10 +1,12 @@
 """Small recordings for tests: of LEDs, each third with a deadline and so a companion."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import r2p
 from r2p.msg import Led
 from r2p.recording.bag import Bag
+from r2p.recording.format import LATCHED
 from r2p.recording.samples import SampleWriter
 from r2p.recording.writer import BagWriter
 
@@ -28,7 +30,13 @@ def leds(count: int, first: int = 1, *, source: str = "IMU") -> Samples:
 
 
 def write(
-    path: Path, samples: Samples, *, chunk_size: int = 200, finish: bool = True, settings: bytes = b"via = []"
+    path: Path,
+    samples: Samples,
+    *,
+    chunk_size: int = 200,
+    finish: bool = True,
+    settings: bytes = b"via = []",
+    latched: Sequence[str] = (),
 ) -> Path:
     with path.open("wb") as file:
         writer = BagWriter(file, chunk_size=chunk_size)
@@ -37,6 +45,8 @@ def write(
             add.write(topic, sample, cls, log_time)
         writer.attach("r2p.toml", "text/plain", settings, T0)
         writer.add_metadata("robot", {"name": "carrot"})
+        if latched:
+            writer.add_metadata(LATCHED, dict.fromkeys(latched, "yes"))
         if finish:
             writer.finish()
         else:

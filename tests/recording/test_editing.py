@@ -21,11 +21,11 @@ def at(number: int) -> int:
 
 
 def edited(
-    path: Path, start: int | None = None, end: int | None = None, *, keep_last: bool = False
+    path: Path, start: int | None = None, end: int | None = None, *, keep_latched: bool = False
 ) -> tuple[Path, Edited]:
     out = path.parent / "out.mcap"
     with Bag(path) as bag:
-        (done,) = deque(cut(bag, out, start=start, end=end, keep_last=keep_last), maxlen=1)
+        (done,) = deque(cut(bag, out, start=start, end=end, keep_latched=keep_latched), maxlen=1)
     check(out)
     return out, done
 
@@ -41,11 +41,13 @@ def test_whole_chunks_are_copied_and_those_at_the_ends_read(tmp_path: Path) -> N
         assert list(part.attachments()) == list(bag.attachments())
 
 
-def test_a_cut_may_keep_the_last_messages_before_it(tmp_path: Path) -> None:
-    samples = [("leds", led(1, source="BASE"), Led, T0), *leds(30)]
-    out, _ = edited(write(tmp_path / "drive.mcap", samples), at(20), at(22), keep_last=True)
+def test_a_cut_may_keep_latched_messages_before_it(tmp_path: Path) -> None:
+    samples = [("leds", led(1, source="BASE"), Led, T0), *leds(30), ("other", led(40), Led, at(21))]
+    samples.sort(key=lambda each: each[3])
+    path = write(tmp_path / "drive.mcap", samples, latched=["leds"])
+    out, _ = edited(path, at(20), at(22), keep_latched=True)
     before = [("leds", samples[0][1], at(20)), ("leds", samples[19][1], at(20))]
-    assert read(out) == [*before, *of(samples[20:22])]
+    assert read(out) == [*before, *of(samples[20:23])]
 
 
 def test_parts_become_one_file(tmp_path: Path) -> None:

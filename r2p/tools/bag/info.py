@@ -1,0 +1,241 @@
+"""`r2p bag info`: what is in a recording, and what is missing."""
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from r2p.codecs import PublisherClass
+from r2p.tools.bag.files import File, opened, size_text
+from r2p.tools.bag.times import iso, length, shown
+from r2p.tools.options import CLASS_NAMES, Format
+from r2p.tools.output import Output, Record
+from r2p.units import SECOND
+
+if TYPE_CHECKING:
+    from r2p.recording.bag import Bag
+    from r2p.recording.channels import BagChannel
+
+_CHUNKS_AT_ONCE = 200  # with messages about losses, which are read without --all: some ten milliseconds
+_TOPIC_COLUMNS = ["topic", "type", "count", "rate", "publishers", "class", "link"]
+_CHANNEL_COLUMNS = ["channel", "type", "count"]
+_LOSS_COLUMNS = ["of", "cause", "count"]
+
+
+async def info(
+    file: File,
+    *,
+    all: Annotated[bool, typer.Option("--all", "-a", help="Count all losses, also in large recordings.")] = False,
+    format: Format = None,
+) -> None:
+    """Show what is in a recording: its length, topics, other channels, and what was lost.
+
+    The rate of a topic is that between its first and last message, to the precision of the file's index. CSV has the
+    topics.
+    """
+    output = Output(format)
+    with opened(file) as bag:
+        record = _record(bag, count_all=all)
+    topics, channels, losses = record["topics"], record["channels"], record["losses"]
+    if output.format == "text":
+        for line in _head(record):
+            await output.remark(line)
+        for rows, columns in ((topics, _TOPIC_COLUMNS), (channels, _CHANNEL_COLUMNS), (losses, _LOSS_COLUMNS)):
+            if rows:
+                await output.remark("")
+                await output.table(rows, columns)
+    elif output.format == "csv":
+        await output.table(topics, _TOPIC_COLUMNS)
+    else:
+        await output.put(record)
+
+
+def _record(bag: "Bag", *, count_all: bool) -> dict[str, Any]:
+    """Return all that is known of a recording; times are in ns since 1970, the duration is in seconds."""
+    chunks = [chunk for file in bag.files for chunk in file.summary.chunks]
+    losses, uncounted = _losses(bag, count_all=count_all)
+    return {
+        "files": [{"path": str(each.file.path), "size": each.file.size} for each in bag.files],
+        "written_by": sorted({each.summary.library for each in bag.files if each.summary.library}),
+        "start": iso(bag.start) if bag.start else None,
+        "end": iso(bag.end) if bag.end else None,
+        "start_ns": bag.start,
+        "end_ns": bag.end,
+        "duration": (bag.end - bag.start) / SECOND,
+        "messages": sum(bag.topics.values()),
+        "chunks": len(chunks),
+        "compression": sorted({each.compression or "none" for each in chunks}),
+        "packed_bytes": sum(each.length for each in chunks),
+        "unpacked_bytes": sum(each.size for each in chunks),
+        "topics": [_topic(bag, name) for name in bag.topics],
+        "channels": _channels(bag),
+        "losses": losses,
+        "uncounted": uncounted,
+        "attachments": sorted({index.name for each in bag.files for index in each.summary.attachments}),
+        "metadata": bag.metadata,
+        "problems": bag.problems,
+        "damaged_chunks": bag.damaged,
+    }
+
+
+def _head(record: dict[str, Any]) -> Iterable[str]:
+    """Yield the lines above the tables."""
+    files = record["files"]
+    size = sum(each["size"] for each in files)
+    more = f" and {len(files) - 1} more files" if len(files) > 1 else ""
+    yield f"file         {files[0]['path']}{more}, {size_text(size)}{_compression(record)}"
+    if record["start_ns"]:
+        start, end = shown(record["start_ns"]), shown(record["end_ns"])
+        end = end.removeprefix(start[:11])  # the date, if it is the same
+        yield f"recorded     {length(record['end_ns'] - record['start_ns'])}, {start} to {end}"
+    if record["written_by"]:
+        yield f"written by   {', '.join(record['written_by'])}"
+    topics = len(record["topics"])
+    yield f"messages     {record['messages']} of {topics} topic{'' if topics == 1 else 's'}"
+    if record["attachments"]:
+        yield f"attachments  {', '.join(record['attachments'])}"
+    if record["damaged_chunks"]:
+        yield f"damaged      {record['damaged_chunks']} chunks, whose messages are not counted"
+    if record["uncounted"]:
+        yield f"not counted  losses in {', '.join(record['uncounted'])}: --all reads these"
+
+
+def _compression(record: dict[str, Any]) -> str:
+    unpacked = record["unpacked_bytes"]
+    if not unpacked or record["compression"] == ["none"]:
+        return ""
+    return f" ({', '.join(record['compression'])}, {record['packed_bytes'] / unpacked:.0%} of {size_text(unpacked)})"
+
+
+def _topic(bag: "Bag", name: str) -> dict[str, Any]:
+    """Return the row of a topic, with all of its channels."""
+    channels = [each for each in bag.channels if each.kind == "samples" and each.info and each.info.topic == name]
+    infos = [each.info for each in channels if each.info]
+    count = sum(each.count for each in channels)
+    publishers = {f"{each.module or '?'}/{each.node}" if each.node else each.module for each in infos}
+    return {
+        "topic": name,
+        "type": " ".join(sorted({each.type_name for each in channels if each.type_name})) or None,
+        "count": count,
+        "rate": _rate(bag, channels, count),
+        "publishers": sorted(filter(None, publishers)),
+        "class": sorted({_class_name(each.publisher_class) for each in infos if each.module or each.node}),
+        "link": sorted({each.link for each in infos if each.link}),
+    }
+
+
+def _class_name(publisher_class: PublisherClass) -> str:
+    return CLASS_NAMES[publisher_class]
+
+
+def _rate(bag: "Bag", channels: "list[BagChannel]", count: int) -> float | None:
+    """Return the messages per second between the first and the last chunk with such messages."""
+    keys = {each.key for each in channels}
+    spans = []
+    for file in bag.files:
+        ids = {number for number, each in file.channels.items() if each.key in keys}
+        spans += [each for each in file.summary.chunks if each.channels is None or not ids.isdisjoint(each.channels)]
+    duration = max((each.end for each in spans), default=0) - min((each.start for each in spans), default=0)
+    if count < 2 or duration <= 0:
+        return None
+    return float(f"{(count - 1) * SECOND / duration:.3g}")
+
+
+def _channels(bag: "Bag") -> list[dict[str, Any]]:
+    """Return the rows of the other channels; one row for all of a name."""
+    counts: Counter[tuple[str, str]] = Counter()
+    for each in bag.channels:
+        if each.kind == "messages":
+            counts[each.name, each.type_name or each.encoding] += each.count
+    return [{"channel": name, "type": type, "count": count} for (name, type), count in sorted(counts.items())]
+
+
+# What was lost
+
+
+def _losses(bag: "Bag", *, count_all: bool) -> tuple[list[Record], list[str]]:
+    """Return what was lost, of which topic and for which cause, and the channels that were not read for that."""
+    from r2p.recording import messages as own
+
+    counts: Counter[tuple[str, str]] = Counter()
+    uncounted = []
+    _add_recorder(bag, counts)
+    for channel, add in ((own.SIGNALS, _add_signals), (own.EVENTS, _add_events)):
+        if count_all or _chunks_with(bag, channel) <= _CHUNKS_AT_ONCE:
+            add(bag, channel, counts)
+        else:
+            uncounted.append(channel)
+    for channel in sorted({each.name for each in bag.channels if each.name.endswith("/frames/details")}):
+        if count_all or _chunks_with(bag, channel) <= _CHUNKS_AT_ONCE:
+            _add_frames(bag, channel, counts)
+        else:
+            uncounted.append(channel)
+    return [{"of": of, "cause": cause, "count": count} for (of, cause), count in counts.most_common()], uncounted
+
+
+def _chunks_with(bag: "Bag", channel: str) -> int:
+    """Return the number of chunks that have messages of a channel."""
+    found = 0
+    for file in bag.files:
+        ids = {number for number, each in file.channels.items() if each.name == channel}
+        found += sum(each.channels is None or not ids.isdisjoint(each.channels) for each in file.summary.chunks)
+    return found
+
+
+def _add_recorder(bag: "Bag", counts: Counter[tuple[str, str]]) -> None:
+    """Add what the recorder lost itself, which its last message says."""
+    last = {}
+    for each in bag.messages(_RECORDER, start=_last_chunk(bag, _RECORDER)):
+        last[each.channel.key, each.channel] = each.message
+    lost: dict[object, Counter[tuple[str, str]]] = {}
+    for (key, _), message in last.items():
+        own: Counter[tuple[str, str]] = Counter()
+        for topic in getattr(message, "topics", ()):
+            own[topic.topic, "the recorder's disk was too slow or full"] = topic.dropped
+            own[topic.topic, "lost before the recorder"] = topic.missed
+        lost[key] = lost.get(key, Counter()) | own  # parts of a recording count on: the largest is all of it
+    for each_own in lost.values():
+        counts.update(+each_own)
+
+
+def _last_chunk(bag: "Bag", channel: str) -> int:
+    """Return when the last chunk with messages of a channel begins, in the file in which that is earliest."""
+    starts = []
+    for file in bag.files:
+        ids = {number for number, each in file.channels.items() if each.name == channel}
+        found = [each for each in file.summary.chunks if each.channels is None or not ids.isdisjoint(each.channels)]
+        starts += [max(each.start for each in found)] if found else []
+    return min(starts, default=0)
+
+
+def _add_signals(bag: "Bag", channel: str, counts: Counter[tuple[str, str]]) -> None:
+    """Add messages that publishers, links and subscribers missed, or sent late."""
+    from r2p.recording.messages import RecordedSignal
+
+    for each in bag.messages(channel, RecordedSignal):
+        signal = each.message
+        detail = signal.reason or (f"by {signal.where}" if signal.where else "")
+        cause = ": ".join(filter(None, (signal.kind, detail)))
+        counts[signal.topic or signal.module, cause] += signal.count
+
+
+def _add_events(bag: "Bag", channel: str, counts: Counter[tuple[str, str]]) -> None:
+    """Add outages of links, with the messages that were lost in them, and events that were too many."""
+    from r2p.recording.messages import RecordedEvent
+
+    for each in bag.messages(channel, RecordedEvent):
+        event = each.message
+        if event.kind == "link down" and event.text != "as the recording began":
+            counts[event.link, "link down"] += 1
+        elif event.kind == "link up" and event.count:
+            counts[event.link, "messages lost while the link was down"] += event.count
+        elif event.kind == "events lost":
+            counts[channel, "too many events for the recorder"] += event.count
+
+
+def _add_frames(bag: "Bag", channel: str, counts: Counter[tuple[str, str]]) -> None:
+    """Add CAN frames that were on the bus and are not in the file."""
+    for each in bag.messages(channel):
+        if getattr(each.message, "event", "") == "lost":
+            counts[channel.removesuffix("/details"), each.message.text] += each.message.count
