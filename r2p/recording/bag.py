@@ -142,9 +142,8 @@ class Bag:
         found: dict[object, BagChannel] = {}
         for each in self.files:
             for channel in each.channels.values():
-                key = (channel.name, channel.encoding, tuple(channel.metadata.items()), channel.schema_name)
-                known = found.get(key)
-                found[key] = channel if known is None else known.plus(channel.count)
+                known = found.get(channel.key)
+                found[channel.key] = channel if known is None else known.plus(channel.count)
         return list(found.values())
 
     @property

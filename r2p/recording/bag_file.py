@@ -14,10 +14,11 @@ from mcap.records import Metadata as MetadataRecord
 from r2p.errors import BagError
 from r2p.recording.channels import BagChannel, channels_of
 from r2p.recording.format import FORMAT, METADATA
-from r2p.recording.records import RECORD_HEAD, ChunkRef, RawMessage, RecordFile, messages, parse
+from r2p.recording.records import RECORD_HEAD, TIME_MAX, ChunkRef, RawMessage, RecordFile, messages, parse
 from r2p.recording.summary import Summary, read_summary
 
 SUFFIX = ".mcap"
+_TIMES_KEPT = 16  # chunks
 _WILDCARDS = frozenset("*?[")
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
@@ -47,6 +48,7 @@ class BagFile:
             self.file.close()
             raise
         self.channels: dict[int, BagChannel] = channels_of(self.summary, is_own=self.is_own)
+        self._times: dict[int, list[tuple[int, int]]] = {}  # by offset of the chunk
 
     def _check_format(self) -> None:
         """Raise BagError for a file of a newer version."""
@@ -88,6 +90,18 @@ class BagFile:
         """
         known = self.channels.keys() if ids is None else ids & self.channels.keys()
         return messages(self.file.chunk(chunk), known, start, end)
+
+    def times(self, chunk: ChunkRef) -> list[tuple[int, int]]:
+        """Return the log times in a chunk with their channels; none if it can't be read. The last chunks are kept."""
+        if chunk.offset not in self._times:
+            try:
+                found = [message[:2] for message in self.messages(chunk, None, 0, TIME_MAX + 1)]
+            except BagError:
+                found = []
+            if len(self._times) >= _TIMES_KEPT:
+                self._times.pop(next(iter(self._times)))
+            self._times[chunk.offset] = found
+        return self._times[chunk.offset]
 
 
 def bag_paths(path: Paths) -> list[Path]:

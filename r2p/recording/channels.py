@@ -91,6 +91,11 @@ class BagChannel(msgspec.Struct, eq=False, dict=True):
             return self.info.type
         return self.schema_name.replace("/msg/", "/")
 
+    @functools.cached_property
+    def key(self) -> tuple[object, ...]:
+        """What this channel has in common with the same one in other parts of a recording."""
+        return self.name, self.encoding, tuple(sorted(self.metadata.items())), self.schema_name
+
     @property
     def is_latched(self) -> bool:
         """Whether rosbag2 recorded the channel as one whose last message late subscribers get."""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 Class: TypeAlias = type[r2p.Message]
 
-_Record: TypeAlias = "tuple[int, _Source, Content, r2p.Sample]"
+_Record: TypeAlias = "tuple[int, _EchoedChannel, Content, r2p.Sample]"
 
 _PIECE = 64  # messages after which the event loop looks for Ctrl-C
 
@@ -63,7 +63,7 @@ async def echo(
     with opened(file) as bag:
         names = _names(bag, topics)
         types = Types(settings(None))
-        sources = {each: _Source(bag, each, types, type, filter) for each in names}
+        sources = {each: _EchoedChannel(bag, each, types, type, filter) for each in names}
         selection = Selection(names, field or [], meta=meta, form=form_of(output, full=full))
         records = _records(bag, sources, *span((bag.start, bag.end), start, end))
         async with output.while_read():
@@ -85,7 +85,7 @@ async def echo(
         raise r2p.Error(f"{missing} of {', '.join(names) or 'any topic'} in this part of the recording")
 
 
-async def _print_header(output: Output, sources: "dict[str, _Source]", selection: Selection) -> None:
+async def _print_header(output: Output, sources: "dict[str, _EchoedChannel]", selection: Selection) -> None:
     """Print the header of CSV with several topics, and check that one of them has each field. Raises UsageError."""
     if selection.labelled:
         received = [f"{META}.received"] if selection.meta else []
@@ -115,7 +115,7 @@ def _names(bag: "Bag", given: list[str] | None) -> list[str]:
     return list(names)
 
 
-class _Source:
+class _EchoedChannel:
     """One topic or channel: the type of its messages, as the user states it or as it was recorded, and their filter."""
 
     def __init__(self, bag: "Bag", name: str, types: Types, given: str | None, filter: str | None) -> None:
@@ -156,10 +156,10 @@ class _Source:
         """Report what is shown in hex."""
         if self._in_hex:
             advice = "" if self._given else ": give --type to decode them"
-            notify(f"{self._in_hex} messages of {self.name} are shown in hex, as their type is unknown{advice}")
+            notify(f"messages of {self.name} are shown in hex, as their type is unknown ({self._in_hex}){advice}")
 
 
-def _records(bag: "Bag", sources: dict[str, _Source], start: int | None, end: int | None) -> Iterator[_Record]:
+def _records(bag: "Bag", sources: dict[str, _EchoedChannel], start: int | None, end: int | None) -> Iterator[_Record]:
     """Yield what passes, in the order of time: the log time, the source, the message and where it comes from."""
     topics = [each.name for each in sources.values() if each.is_topic]
     streams = [_of_topics(bag.records(topics, start=start, end=end), sources)] if topics else []
@@ -168,7 +168,7 @@ def _records(bag: "Bag", sources: dict[str, _Source], start: int | None, end: in
     return heapq.merge(*streams, key=itemgetter(0))
 
 
-def _of_topics(records: "Iterable[RecordedSample]", sources: dict[str, _Source]) -> Iterator[_Record]:
+def _of_topics(records: "Iterable[RecordedSample]", sources: dict[str, _EchoedChannel]) -> Iterator[_Record]:
     for each in records:
         source = sources[each.topic]
         content = source.content(each.sample.data, each.cls)
@@ -176,7 +176,7 @@ def _of_topics(records: "Iterable[RecordedSample]", sources: dict[str, _Source])
             yield each.log_time, source, content, each.sample
 
 
-def _of_channel(messages: "Iterable[RecordedMessage[Any]]", source: _Source) -> Iterator[_Record]:
+def _of_channel(messages: "Iterable[RecordedMessage[Any]]", source: _EchoedChannel) -> Iterator[_Record]:
     for each in messages:
         if source.passes(each.message):
             yield each.log_time, source, each.message, r2p.Sample(b"", r2p.Source(), each.publish_time)

@@ -2,19 +2,22 @@
 
 import contextlib
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from r2p.clock import duration
 from r2p.tools.bag.files import Exclude, File, Files, Topics, opened, run_steps, selection, size_text
-from r2p.tools.bag.times import End, Start, length, shown, span
-from r2p.tools.output import notify
+from r2p.tools.bag.times import End, Start, iso, length, shown, span
+from r2p.tools.options import Format
+from r2p.tools.output import Output, notify
 from r2p.tools.session import UsageError
 from r2p.units import SECOND
 
+if TYPE_CHECKING:
+    from r2p.recording.editing import Edited
+
 OutputFile = Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE", help="The file to write.")]
-_SHIFT_DIGITS = 20
 
 
 async def cut(
@@ -28,6 +31,7 @@ async def cut(
     latched: Annotated[
         bool, typer.Option("--latched", help="Begin with the last messages of latched topics before the start.")
     ] = False,
+    format: Format = None,
 ) -> None:
     """Write a part of a recording into a new file: r2p bag cut drive.mcap --start 14:03 --end 14:04 -o crash.mcap.
 
@@ -43,7 +47,7 @@ async def cut(
         if latched and not bag.latched:
             notify("the recording has no latched topics, so --latched adds nothing")
         done = await run_steps(steps(bag, path, start=first, end=last, wanted=wanted, keep_latched=latched))
-    _report(path, 0 if done is None else done.unreadable)
+    await _report(path, done, format)
 
 
 async def merge(
@@ -60,10 +64,12 @@ async def merge(
     ] = None,
     topics: Topics = None,
     exclude: Exclude = None,
+    format: Format = None,
 ) -> None:
     """Write several recordings into one new file, in the order of time.
 
-    For example r2p bag merge robot.mcap laptop.mcap -o all.mcap --offset laptop.mcap=-2.5. With --offset, stamps and deadlines move as log times do; times inside of messages stay.
+    For example r2p bag merge robot.mcap laptop.mcap -o all.mcap --offset laptop.mcap=-2.5. With --offset, stamps and
+    deadlines move as log times do; times inside of messages stay.
     """
     from r2p.recording.editing import merge as steps
 
@@ -77,7 +83,7 @@ async def merge(
         bags = [stack.enter_context(opened(each)) for each in files]
         wanted = selection(bags, topics, exclude)
         done = await run_steps(steps([(bag, offsets[i]) for i, bag in enumerate(bags)], output, wanted=wanted))
-    _report(output, 0 if done is None else done.unreadable)
+    await _report(output, done, format)
 
 
 def _check_new(path: Path) -> None:
@@ -105,12 +111,21 @@ def _nanoseconds(value: str, text: str) -> int:
         raise UsageError(f"--offset {text}: write the time as 2.5, -2.5 or 300ms") from None
 
 
-def _report(path: Path, unreadable: int) -> None:
-    """Say what is in the new file."""
+async def _report(path: Path, done: "Edited | None", format: Any) -> None:
+    """Print what is in the new file."""
     with opened(path) as bag:
-        count = sum(bag.topics.values())
-        of = f"{count} messages of {len(bag.topics)} topics" if len(bag.topics) != 1 else f"{count} messages of 1 topic"
-        span = f", {length(bag.end - bag.start)} from {shown(bag.start)}" if bag.start else ""
-    if unreadable:
-        notify(f"{unreadable} chunks could not be read, and are missing in {path}")
-    notify(f"{path}: {of}{span}, {size_text(path.stat().st_size)}")
+        size = sum(each.file.size for each in bag.files)
+        record = {
+            "file": str(path),
+            "size": size,
+            "start": iso(bag.start) if bag.start else None,
+            "duration": (bag.end - bag.start) / SECOND,
+            "topics": len(bag.topics),
+            "messages": sum(bag.topics.values()),
+        }
+        when = f"{length(bag.end - bag.start)} from {shown(bag.start)}" if bag.start else "empty"
+    if done is not None and done.unreadable:
+        notify(f"{done.unreadable} chunks could not be read, and are missing in {path}")
+    topics = f"{record['topics']} topic{'' if record['topics'] == 1 else 's'}"
+    text = f"{path} has {record['messages']} messages of {topics}, {when}: {size_text(size)}"
+    await Output(format).put(record, text)

@@ -10,13 +10,14 @@ from r2p.codecs import PublisherClass
 from r2p.tools.bag.files import File, opened, size_text
 from r2p.tools.bag.times import iso, length, shown
 from r2p.tools.options import CLASS_NAMES, Format
-from r2p.tools.output import Output, Record
+from r2p.tools.output import Output
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
     from r2p.recording.bag import Bag
     from r2p.recording.channels import BagChannel
 
+_RECORDER = "/r2p/recorder"
 _CHUNKS_AT_ONCE = 200  # with messages about losses, which are read without --all: some ten milliseconds
 _TOPIC_COLUMNS = ["topic", "type", "count", "rate", "publishers", "class", "link"]
 _CHANNEL_COLUMNS = ["channel", "type", "count"]
@@ -31,8 +32,7 @@ async def info(
 ) -> None:
     """Show what is in a recording: its length, topics, other channels, and what was lost.
 
-    The rate of a topic is that between its first and last message, to the precision of the file's index. CSV has the
-    topics.
+    The rate of a topic is that between its first and its last message. CSV has the topics.
     """
     output = Output(format)
     with opened(file) as bag:
@@ -41,6 +41,7 @@ async def info(
     if output.format == "text":
         for line in _head(record):
             await output.remark(line)
+        topics = [each | {"rate": each["rate"] and f"{each['rate']:g} Hz"} for each in topics]
         for rows, columns in ((topics, _TOPIC_COLUMNS), (channels, _CHANNEL_COLUMNS), (losses, _LOSS_COLUMNS)):
             if rows:
                 await output.remark("")
@@ -130,16 +131,18 @@ def _class_name(publisher_class: PublisherClass) -> str:
 
 
 def _rate(bag: "Bag", channels: "list[BagChannel]", count: int) -> float | None:
-    """Return the messages per second between the first and the last chunk with such messages."""
+    """Return the messages per second between the first and the last one of these channels."""
     keys = {each.key for each in channels}
-    spans = []
+    found = []
     for file in bag.files:
-        ids = {number for number, each in file.channels.items() if each.key in keys}
-        spans += [each for each in file.summary.chunks if each.channels is None or not ids.isdisjoint(each.channels)]
-    duration = max((each.end for each in spans), default=0) - min((each.start for each in spans), default=0)
-    if count < 2 or duration <= 0:
-        return None
-    return float(f"{(count - 1) * SECOND / duration:.3g}")
+        ids = frozenset(number for number, each in file.channels.items() if each.key in keys)
+        chunks = [each for each in file.summary.chunks if each.channels is None or not ids.isdisjoint(each.channels)]
+        if chunks:
+            found += [(file, min(chunks, key=lambda each: each.start), ids)]
+            found += [(file, max(chunks, key=lambda each: each.end), ids)]
+    times = [time for file, chunk, ids in found for time, channel in file.times(chunk) if channel in ids]
+    duration = max(times, default=0) - min(times, default=0)
+    return float(f"{(count - 1) * SECOND / duration:.3g}") if count > 1 and duration > 0 else None
 
 
 def _channels(bag: "Bag") -> list[dict[str, Any]]:
@@ -148,30 +151,28 @@ def _channels(bag: "Bag") -> list[dict[str, Any]]:
     for each in bag.channels:
         if each.kind == "messages":
             counts[each.name, each.type_name or each.encoding] += each.count
-    return [{"channel": name, "type": type, "count": count} for (name, type), count in sorted(counts.items())]
+    return [{"channel": name, "type": kind, "count": count} for (name, kind), count in sorted(counts.items())]
 
 
 # What was lost
 
 
-def _losses(bag: "Bag", *, count_all: bool) -> tuple[list[Record], list[str]]:
+def _losses(bag: "Bag", *, count_all: bool) -> tuple[list[dict[str, Any]], list[str]]:
     """Return what was lost, of which topic and for which cause, and the channels that were not read for that."""
     from r2p.recording import messages as own
 
     counts: Counter[tuple[str, str]] = Counter()
     uncounted = []
     _add_recorder(bag, counts)
-    for channel, add in ((own.SIGNALS, _add_signals), (own.EVENTS, _add_events)):
+    details = {each.name for each in bag.channels if each.name.endswith("/frames/details")}
+    sources = {own.SIGNALS: _add_signals, own.EVENTS: _add_events} | dict.fromkeys(sorted(details), _add_frames)
+    for channel, add in sources.items():
         if count_all or _chunks_with(bag, channel) <= _CHUNKS_AT_ONCE:
             add(bag, channel, counts)
         else:
             uncounted.append(channel)
-    for channel in sorted({each.name for each in bag.channels if each.name.endswith("/frames/details")}):
-        if count_all or _chunks_with(bag, channel) <= _CHUNKS_AT_ONCE:
-            _add_frames(bag, channel, counts)
-        else:
-            uncounted.append(channel)
-    return [{"of": of, "cause": cause, "count": count} for (of, cause), count in counts.most_common()], uncounted
+    rows = [{"of": of, "cause": cause, "count": count} for (of, cause), count in counts.most_common() if count]
+    return rows, uncounted
 
 
 def _chunks_with(bag: "Bag", channel: str) -> int:
