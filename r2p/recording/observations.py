@@ -41,6 +41,7 @@ SIGNALS_MAX = 1000
 """Signals in a second that are recorded one by one; further ones are added up, by publisher and reason."""
 
 _SETTLED, _PATIENCE = 3 * SECOND, 10 * SECOND  # after which the network is known, and described in attachments
+_FIRMWARE_SILENT = 15.0  # s; it says ALIVE once in all its announcements, one of which it sends each half second
 _MODULES_MAX = 256  # modules that are asked: names come from the network, and channels of a file stay
 
 logger = get_logger("r2p.recording")
@@ -152,6 +153,7 @@ class Observations:
     async def _look_each_second(self, tasks: asyncio.TaskGroup) -> None:
         while True:
             try:
+                self._note_silent_firmware()
                 self._watch_modules(tasks)
                 self._buses.look(tasks)
             except Closed:
@@ -160,6 +162,17 @@ class Observations:
                 self._describe()
             await asyncio.sleep(1.0)
             self._signals.flush()
+
+    def _note_silent_firmware(self) -> None:
+        """Record firmware that is heard no more, or again: discovery remembers it for good."""
+        for view in self._module.network.modules():
+            if view.kind != "firmware":
+                continue
+            if view.age < _FIRMWARE_SILENT:
+                self._record_module(view)
+            elif self._states.pop(view.name, None) is not None:
+                text = f"firmware: not heard for {_FIRMWARE_SILENT:.0f} s"
+                self._record(EVENTS, RecordedEvent(kind="module silent", module=cut(view.name), text=text))
 
     def _watch_modules(self, tasks: asyncio.TaskGroup) -> None:
         """Ask modules that are new, and no longer those that are gone."""

@@ -32,6 +32,7 @@ from r2p.recording.module_watch import growth
 from r2p.recording.observations import SIGNALS_MAX, Observations
 from r2p.sim.transport import SimPort
 from r2p.testing.network import Network, node_in
+from tests.tools.rig import VIA, Firmware
 from tests.transports.rtcan.networks import Lab, until
 
 pytestmark = pytest.mark.virtual_time
@@ -219,6 +220,19 @@ async def test_a_silent_module_delays_no_other(r2p_network: Network) -> None:
     assert max(after - before for before, after in itertools.pairwise(times)) < 1.5 * SECOND
     assert [each.module for each in recorded.events("no answer", "module silent")][:1] == ["DEAD"]
     assert not [time for time, _ in recorded.timed(ModuleStatistics, "/r2p/statistics/DEAD") if time > silent_since]
+
+
+async def test_firmware_that_dies_is_noted_and_its_return() -> None:
+    async with r2p.Module("ROBOT", via=VIA, watchdog=False) as robot, observed(robot) as recorded:
+        imu = Firmware("IMU")
+        for _ in range(5):
+            imu.alive()
+            await asyncio.sleep(2.0)
+        await asyncio.sleep(20.0)
+        imu.alive()
+        await asyncio.sleep(2.0)
+    events = [each for each in recorded.events() if each.module == "IMU"]
+    assert [each.kind for each in events] == ["module found", "module silent", "module found"]
 
 
 async def test_parameters_and_their_changes_and_the_network_are_in_the_file(r2p_network: Network) -> None:
