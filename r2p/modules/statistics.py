@@ -126,7 +126,8 @@ class ForwardedTopic(Message, name="r2p_msgs/ForwardedTopic"):
 class ModuleStatistics(Message, name="r2p_msgs/ModuleStatistics"):
     """The counters of a module, from the start of each entry on; `uptime` and `cpu` in seconds.
 
-    `cpu` is the processor time of the module's process, all modules in it together.
+    `cpu` is the processor time of the module's process, all modules in it together; NaN under virtual time, where
+    each run is the same.
     """
 
     uptime: f64 = 0.0
@@ -160,10 +161,11 @@ def collect(manager: LinkManager, supervisors: Mapping[str, Supervisor]) -> Modu
     """Return the statistics of a module with these links and nodes."""
     nodes = [each.node for each in supervisors.values()]
     processor = os.times()
+    cpu = math.nan if manager.space.clock.virtual else processor.user + processor.system
     remote = [(topic.name, each) for topic in manager.space.topics.values() for each in topic.remote_subscribers]
     return ModuleStatistics(
         uptime=(manager.space.clock.monotonic() - manager.opened_at) / SECOND,
-        cpu=processor.user + processor.system,
+        cpu=cpu,
         nodes=_limited(
             NodeStatistics(name, running=each.running, restarts=each.restarts) for name, each in supervisors.items()
         ),

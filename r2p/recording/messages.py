@@ -3,7 +3,7 @@
 import math
 from typing import Annotated
 
-from r2p.messages import Max, Message, f64, i8, i64, u8, u64
+from r2p.messages import Max, Message, Timestamp, f64, i8, i64, u8, u32, u64
 from r2p.recording.format import OWN_PREFIX
 
 REST_MAX = 1 << 16
@@ -15,8 +15,8 @@ TEXT_MAX, VALUE_MAX = 1023, 1 << 16
 TOPICS_MAX = 4096
 """Topics of one message of the recorder's losses."""
 
-EVENTS, SIGNALS, BUSES, SLOTS, PARAMETERS = (
-    f"{OWN_PREFIX}{name}" for name in ("events", "signals", "buses", "slots", "parameters")
+EVENTS, SIGNALS, BUSES, SLOTS, PARAMETERS, LOGS = (
+    f"{OWN_PREFIX}{name}" for name in ("events", "signals", "buses", "slots", "parameters", "log")
 )
 """The channels of these messages."""
 LOSSES = f"{OWN_PREFIX}recorder"
@@ -164,6 +164,21 @@ class SlotTable(Message, name="r2p_msgs/SlotTable"):
     slots_in_cycle: u8 = 0
     master: _Name = ""
     owners: Annotated[tuple[SlotOwner, ...], Max(256)] = ()
+
+
+class LogRecord(Message, name="rcl_interfaces/Log"):
+    """A log record of a node, as in ROS 2 (channel `/r2p/log`): `name` is MODULE/NODE, `level` as in Python's logging.
+
+    `file`, `function` and `line` are not known.
+    """
+
+    stamp: Timestamp = Timestamp()
+    level: u8 = 0
+    name: _Name = ""
+    msg: _Text = ""
+    file: _Name = ""
+    function: _Name = ""
+    line: u32 = 0
 
 
 class ParameterValue(Message, name="r2p_msgs/ParameterValue"):

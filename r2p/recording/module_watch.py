@@ -93,11 +93,7 @@ class ModuleWatch:
             await self._pause()
 
     async def _statistics(self) -> ModuleStatistics:
-        if not self._is_own:
-            return await self._module.network.statistics(self.name)
-        statistics = self._module.statistics()
-        # Processor time is real: under virtual time the same run would not write the same bytes.
-        return msgspec.structs.replace(statistics, cpu=0.0) if self._clock.virtual else statistics
+        return self._module.statistics() if self._is_own else await self._module.network.statistics(self.name)
 
     def _note_silence(self, reason: str) -> None:
         if not self._silent:

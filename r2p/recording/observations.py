@@ -1,6 +1,7 @@
 """What a recorder sees besides messages, as the messages of `r2p.recording.messages`.
 
     /r2p/events              RecordedEvent: links, modules, masters, notices
+    /r2p/log                 LogRecord: what nodes log, as in ROS
     /r2p/signals             RecordedSignal: messages that were missed, late or lost, and how that is known
     /r2p/buses               BusState: master and clock of each RTCAN bus of the recording module, once a second
     /r2p/slots               SlotTable: the owners of the slots of each bus
@@ -30,6 +31,7 @@ from r2p.modules.module import Module
 from r2p.protocols.discovery.events import Mismatched, ModuleChanged, ModuleGone, NameConflict
 from r2p.recording.bus_watch import BusWatch
 from r2p.recording.entries import AttachmentEntry, BagEntry, MessageEntry
+from r2p.recording.log_watch import LogWatch
 from r2p.recording.messages import EVENTS, SIGNALS, TEXT_MAX, RecordedEvent, RecordedSignal, cut
 from r2p.recording.module_watch import ModuleWatch
 from r2p.recording.network_files import NETWORK, PARAMETERS_FILE, network_file, parameters_file
@@ -74,6 +76,7 @@ class Observations:
     async def __aenter__(self) -> Self:
         """Begin to observe. Raises Closed if the module is not open."""
         self._buses = BusWatch(self._module, self._record)
+        self._log = LogWatch(self._module, self._record)
         self._events = self._module.events()
         self._module.space.signal_listeners.append(self._signals.write)
         self._begin()
@@ -89,6 +92,7 @@ class Observations:
         await asyncio.wait([self._task])
         self._signals.flush()
         self._buses.close()
+        self._log.close()
         self._describe()
 
     async def _run(self) -> None:
@@ -156,6 +160,7 @@ class Observations:
                 self._note_silent_firmware()
                 self._watch_modules(tasks)
                 self._buses.look(tasks)
+                self._log.look(tasks)
             except Closed:
                 return
             if self._is_known():

@@ -16,18 +16,19 @@ from typing import Final
 import msgspec
 
 from r2p.errors import DecodeError
-from r2p.msg import Log
-from r2p.names import LOG, module_alias
 from r2p.recording.bag import Bag
-from r2p.recording.format import OWN_PREFIX
 from r2p.recording.messages import (
     EVENTS,
+    LOGS,
+    LOSSES,
     PARAMETERS,
     SIGNALS,
     SLOTS,
+    LogRecord,
     ParameterValue,
     RecordedEvent,
     RecordedSignal,
+    RecorderLosses,
     SampleMeta,
     SlotOwner,
     SlotTable,
@@ -155,7 +156,7 @@ def _misses(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
             continue
         found = _LOGGED_MISS.search(each.text)
         if found is not None:
-            reasons[each.about.partition("/")[0], found[1]] = time, found[2]
+            reasons[each.about.rpartition("/")[0], found[1]] = time, found[2]
         yield each
 
 
@@ -164,7 +165,7 @@ def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tu
     about = f"{signal.topic} of {owner}" if signal.topic else f"link {signal.where} of {owner}"
     text = signal.reason
     if signal.source == "statistics" and not text:
-        logged_at, reason = reasons.get((module_alias(signal.module.rpartition("/")[2]), signal.topic), (0, ""))
+        logged_at, reason = reasons.get((signal.module, signal.topic), (0, ""))
         text = f"{reason}, as it logged" if reason and time - logged_at <= 2 * _TOGETHER else "as it counted"
     elif signal.where and signal.topic:
         text = f"{text} ({signal.where})"
@@ -180,16 +181,11 @@ def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tu
 
 
 def _log(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
-    topics = [name for name in bag.topics if name == LOG or name.endswith(f"/{LOG}")]
-    for recorded in bag.records(topics, start=start, end=end) if topics else ():
-        try:
-            record = Log.decode(recorded.sample.data)
-        except DecodeError:
-            continue  # another program uses the name
+    for each in bag.messages(LOGS, LogRecord, start=start, end=end):
+        record = each.message
         if record.level >= logging.WARNING:
-            about = "/".join(filter(None, (record.module, record.node)))
-            text = f"{logging.getLevelName(record.level)}: {record.text}"
-            yield Happening(time=recorded.log_time, kind="log", about=about, text=text)
+            text = f"{logging.getLevelName(record.level)}: {record.msg}"
+            yield Happening(time=each.log_time, kind="log", about=record.name, text=text)
 
 
 def _overdue(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
@@ -260,7 +256,7 @@ def _parameters(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
 def _recorder(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
     """Yield what the recorder lost; its messages have totals."""
     before: dict[str, tuple[int, int]] = {}
-    for each in bag.messages(f"{OWN_PREFIX}recorder", end=end):
+    for each in bag.messages(LOSSES, RecorderLosses, end=end):
         for topic in each.message.topics:
             dropped, missed = before.get(topic.topic, (0, 0))
             before[topic.topic] = topic.dropped, topic.missed

@@ -57,7 +57,7 @@ async def test_counters_by_node_topic_and_link_and_the_least_laxity_on_a_bus() -
         assert math.isnan(laxities["leds"])
         assert [(each.node, each.running, each.restarts) for each in far.nodes] == [(alice.name, True, 0)]
         assert far.uptime > 0
-        assert far.cpu > 0
+        assert math.isnan(far.cpu)  # under virtual time
 
 
 @virtual

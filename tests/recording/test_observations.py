@@ -1,17 +1,22 @@
 """What a recorder sees besides messages: what goes wrong on emulated buses and networks is in its entries."""
 
 import asyncio
+import functools
 import itertools
 import json
 from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import TypeVar
 
 import msgspec
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 import r2p
+import r2p.sim
 from r2p.clock import clock_of
 from r2p.messages import Message
 from r2p.modules.statistics import ModuleStatistics, PublisherStatistics, ReasonCount
@@ -30,6 +35,7 @@ from r2p.recording.messages import (
 )
 from r2p.recording.module_watch import growth
 from r2p.recording.observations import SIGNALS_MAX, Observations
+from r2p.recording.timeline import slots_at, timeline
 from r2p.sim.transport import SimPort
 from r2p.testing.network import Network, node_in
 from tests.tools.rig import VIA, Firmware
@@ -277,3 +283,57 @@ def test_growth_survives_restarts_and_closed_publishers() -> None:
     assert grown(counted(3), counted(4, 0.5)) == {"missed": 4, "late": 1}, "restarted: all of it is new"
     assert grown(counted(3), counted(1, 6.0)) == {"missed": 1}, "closed, and advertised again"
     assert grown(counted(3), msgspec.structs.replace(counted(0, 6.0), publishers=())) == {}
+
+
+async def drive(path: Path) -> None:
+    """Record a bus whose master dies, with a deadline that is missed before."""
+    bus = Lab()
+    boss_module = bus.module("BOSS", options={"priority": 9})
+    async with boss_module as boss, bus.module("SPARE"), bus.module("EYE", options={"priority": 0}) as eye:
+        recorder = r2p.Recorder(bus.host("EYE"), path, [])
+        async with recorder:
+            boss.subscribe("grip", Led, queue=1)
+            grip = boss.advertise("grip", Led, r2p.Sporadic(0.02))
+            publisher = boss.advertise("encoder", Led, r2p.Periodic(0.01, Led))
+            eye.subscribe("encoder", Led, queue=1, keep="newest", lossy=True)
+            await publisher.ready(timeout=10.0)
+            await asyncio.sleep(3.0)
+            grip.publish_nowait(Led())
+            grip.publish_nowait(Led())
+            await asyncio.sleep(2.0)
+            port = bus.link("BOSS").driver.port
+            assert isinstance(port, SimPort)
+            port.controller.power_off()
+            await asyncio.sleep(8.0)
+
+
+async def test_the_file_alone_says_who_owned_which_slot_and_what_was_missed(tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap"
+    await drive(path)
+    with r2p.Bag(path) as bag:
+        found = [(each.kind, each.about, each.text) for each in timeline(bag)]
+        owned = {each.topic: each.module for each in slots_at(bag, bag.start + 5 * SECOND)[0].owners}
+        in_the_end = {each.topic: each.module for each in slots_at(bag, bag.end)[0].owners}
+        assert not bag.undecodable
+    assert (owned, in_the_end) == ({"sync": "BOSS", "encoder": "BOSS"}, {"sync": "SPARE"})
+    expected = [
+        ("missed", "grip of BOSS/test", "no room by the deadline, as it logged"),
+        ("master", "sim:", "no RTCAN master: no sync for too long"),
+        ("slots", "encoder of BOSS", "has lost slot 1 on sim"),
+        ("module", "BOSS", "silent"),
+    ]
+    assert [each for each in found if each in expected] == expected
+    with path.open("rb") as file:
+        decoded = Counter(
+            each.channel.topic.split("/")[2]
+            for each in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+            if each.decoded_message is not None
+        )
+    kinds = {"events", "signals", "buses", "slots", "bus_load", "statistics", "log", "recorder"}
+    assert decoded.keys() == kinds
+
+
+def test_the_same_run_writes_the_same_bytes(tmp_path: Path) -> None:
+    for name in "ab":
+        r2p.sim.run(functools.partial(drive, tmp_path / name))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()

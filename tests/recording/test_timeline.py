@@ -8,15 +8,17 @@ from pathlib import Path
 import pytest
 
 import r2p
-from r2p.messages import Message, Timestamp
-from r2p.msg import Led, Log
+from r2p.messages import Message
+from r2p.msg import Led
 from r2p.recording.bag import Bag
 from r2p.recording.entries import BagEntry, EntryWriter, MessageEntry, SampleEntry
 from r2p.recording.messages import (
     EVENTS,
+    LOGS,
     PARAMETERS,
     SIGNALS,
     SLOTS,
+    LogRecord,
     ParameterValue,
     RecordedEvent,
     RecordedSignal,
@@ -48,10 +50,8 @@ def signal(kind: str, reason: str, where: str, **numbers: float) -> RecordedSign
     return RecordedSignal(kind, "publisher", "steer", "ROBOT", "control", 2, reason, where, **numbers)  # type: ignore[arg-type]
 
 
-def log(seconds: float, level: int, text: str) -> SampleEntry:
-    now = START + round(seconds * SECOND)
-    record = Log(stamp=Timestamp.from_ns(now), level=level, module="ARM", node="reach", text=text)
-    return SampleEntry("log", r2p.Sample(record.encode(), r2p.Source("ARM", "log", "tcp"), now, sequence=1), Log, now)
+def log(seconds: float, level: int, text: str) -> MessageEntry:
+    return at(seconds, LOGS, LogRecord(level=level, name="ARM/reach", msg=text))
 
 
 def led(seconds: float, late: float, sequence: int) -> SampleEntry:
