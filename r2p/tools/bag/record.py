@@ -21,7 +21,7 @@ from r2p.tools.config import find
 from r2p.tools.keyboard import on_key
 from r2p.tools.options import Format, byte_size, long_seconds, topic_pattern
 from r2p.tools.output import Output, notify
-from r2p.tools.session import Session, Settings, UsageError, call_after
+from r2p.tools.session import Session, Settings, UsageError, call_after, wait_until
 from r2p.tools.topic.watching import HINT_AFTER, is_published, suggest_topics
 from r2p.tools.types import Types, is_service, load_service
 from r2p.units import SECOND
@@ -37,6 +37,7 @@ SNAPSHOT_SERVICE = "bag/snapshot"
 
 _MIN_FREE = 1_000_000_000  # bytes
 _ANSWER_MAX = 160  # characters of an answer to that service, which all links carry
+_LINK_UP = 2.0  # seconds to wait for a link before the recording begins: others may come later
 _LIMITS = ("max_size", "max_duration", "split", "snapshot", "min_free", "max_total")
 
 
@@ -49,6 +50,8 @@ def check(settings: Settings, given: Mapping[str, Any]) -> None:
     for option, texts in (("TOPIC", given["topics"]), ("--exclude", given["exclude"])):
         for each in texts or ():
             topic_pattern(each.removeprefix("/"), option)
+    if not settings.via:
+        raise UsageError("no network to record: give --via tcp:HOST:PORT or set R2P_VIA")
     if given["frames"] and not _buses(settings):
         raise UsageError("--frames records the CAN buses of --via: give --via rtcan:can0 (or a sim: URL)")
     if given["frames"] and has_topics(given):
@@ -147,6 +150,8 @@ async def _record(
     session: Session, recorder: "Recorder", output: Output, topics: list[str], buses: "list[FrameRecorder]"
 ) -> None:
     clock = session.module.space.clock
+    with session.waiting("a link"):  # so that there is no file of a network that can't be reached
+        await wait_until(lambda: any(link.up for link in session.module.links), _LINK_UP)
     began = clock.monotonic()
     try:
         async with recorder:

@@ -20,7 +20,7 @@ from r2p.sim.transport import can_bus
 from r2p.tools.bag.record import SNAPSHOT_SERVICE, check, has_topics, record
 from r2p.tools.options import byte_size, long_seconds
 from r2p.tools.session import Settings, UsageError, join
-from tests.tools.rig import PUBLISH, listening, printed, process, robot, tool
+from tests.tools.rig import PUBLISH, VIA, listening, printed, process, robot, tool
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -158,16 +158,21 @@ def test_a_process_ends_its_file_and_writes_snapshots_at_signals(tmp_path: Path)
 )
 def test_what_makes_no_sense_is_refused(given: dict[str, Any], error: str) -> None:
     with pytest.raises(UsageError, match=error):
-        check(Settings(), GIVEN | given)
+        check(Settings(via=[VIA]), GIVEN | given)
+
+
+def test_it_needs_a_network() -> None:
+    with pytest.raises(UsageError, match="no network to record"):
+        check(Settings(), GIVEN | {"all": True})
 
 
 def test_an_existing_file_is_refused_at_once(tmp_path: Path) -> None:
     path = tmp_path / "one.mcap"
     path.touch()
     with pytest.raises(UsageError, match="exists, and is never overwritten"):
-        check(Settings(), GIVEN | {"all": True, "output": path})
+        check(Settings(via=[VIA]), GIVEN | {"all": True, "output": path})
     with pytest.raises(UsageError, match="no directory"):
-        check(Settings(), GIVEN | {"all": True, "output": tmp_path / "no" / "one.mcap"})
+        check(Settings(via=[VIA]), GIVEN | {"all": True, "output": tmp_path / "no" / "one.mcap"})
 
 
 def test_sizes_and_times_have_units() -> None:
