@@ -269,8 +269,8 @@ class Recorder:
                 topic.review()
 
     def _own_changed(self, topic: Topic) -> None:
-        """Record a topic that this module publishes, from its first message on."""
-        if topic.publishers:
+        """Record a topic that this module publishes, from its first message on; those of tools are not of interest."""
+        if topic.publishers and not self._module.observer:
             self._consider(topic.name)
 
     def _consider(self, name: str) -> None:

@@ -40,6 +40,7 @@ class ImmediateSubscriber(SubscriberQueue):
 
     def open(self, name: str, layout: Layout[Any] | None) -> Topic:
         """Join the topic; without a layout, with messages of any type. Raises TypeMismatch if it has another one."""
+        self.typed = layout is not None
         self.topic = self.space.open(name, layout)
         self.topic.join(self)
         self.space.changed(self.topic)

@@ -182,6 +182,7 @@ class SubscriberQueue(Sink):
         "queue",
         "size_max",
         "too_long",
+        "typed",
         "wait_queue",
         "waiter",
     )
@@ -201,6 +202,8 @@ class SubscriberQueue(Sink):
         """Unread messages. A link or a publisher appends to it itself, after a look at `limit`."""
         self.size_max = SIZE_MAX
         """Bytes of the longest message that the subscriber's type allows."""
+        self.typed = True
+        """False for a subscriber of any type, which gets packed messages."""
         self.too_long = 0
         """Messages longer than the subscriber's type allows."""
         self.waiter: asyncio.Future[None] | None = None

@@ -98,6 +98,7 @@ class Subscriber(Generic[T]):
         self._sink = SubscriberQueue(
             space.wake_scheduler, node, options.queue, lossy=options.lossy, keep_oldest=options.keep == "oldest"
         )
+        self._sink.typed = layout is not None
         if layout is not None:
             self._sink.size_max = layout.size
         self._node = node

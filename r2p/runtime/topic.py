@@ -267,6 +267,11 @@ class Topic:
         return not (self.publishers or self.queues)
 
     @property
+    def typed(self) -> bool:
+        """Return whether a node of this module uses the topic with a type: what only looks at it accepts any."""
+        return bool(self.publishers) or any(queue.typed for queue in self.queues)
+
+    @property
     def slot_publishers(self) -> list[SlotPublisher]:
         """The publishers for which a bus may reserve slots."""
         return [each for each in self.publishers if isinstance(each, SlotPublisher)]
@@ -399,9 +404,11 @@ class TopicSpace:
         return ANY_TYPE if link is None else link.fingerprint_of(topic.name, source)
 
     def release(self, topic: Topic) -> None:
-        """Inform the links of a change; forget the topic's type with its last user, and the topic if no link has it."""
-        self.changed(topic)
-        if topic.unused:
+        """Inform the links of a change; forget the topic's type with the last one that has it, and the topic itself if
+        neither this module nor a link uses it.
+        """
+        if not topic.typed:
             topic.layout, topic.unnamed_type = None, TopicType()
-            if not topic.in_use:
-                self.topics.pop(topic.name, None)
+        self.changed(topic)
+        if topic.unused and not topic.in_use:
+            self.topics.pop(topic.name, None)

@@ -6,12 +6,15 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
+from mcap.reader import make_reader
 
 import r2p
 from r2p.msg import Led, Log, Velocity3
 from r2p.recording import topics as recorded_topics
 from r2p.recording.bag import Bag
+from r2p.recording.messages import LOSSES, RecorderLosses, TopicLosses
 from r2p.recording.recorder import Recorder, TopicSelection
+from r2p.ros.cdr import cdr
 from tests.tools.rig import VIA, Firmware, keep_types
 
 if TYPE_CHECKING:
@@ -156,3 +159,52 @@ def test_a_selection_has_names_and_patterns() -> None:
     assert TopicSelection().has("anything")
     with pytest.raises(r2p.InvalidName, match="messages of r2p itself"):
         TopicSelection(["R2P"])
+
+
+@pytest.mark.virtual_time
+async def test_a_recorder_holds_no_type_and_no_topic_of_its_module(tmp_path: Path) -> None:
+    """A node may return with another type, and the recording has both."""
+    path = tmp_path / "own.mcap"
+
+    async def publish(node: r2p.Node, message: r2p.Message) -> None:
+        await node.advertise("value", type(message)).publish(message)
+
+    async with r2p.Module("BOT", via=[]) as bot:
+        async with Recorder(bot, path):
+            for number, message in enumerate((Led(1, 2), Private(3), Led(4, 5))):
+                bot.start(publish, message, name=f"node{number}")
+                await bot.wait()
+        assert "value" not in bot.space.topics
+    assert [kind for kind, _ in recorded(path, "value")] == ["r2p_msgs/Led", "tests/Private", "r2p_msgs/Led"]
+
+
+@pytest.mark.virtual_time
+async def test_publishers_without_end_are_recorded_without_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded_topics, "PUBLISHERS_MAX", 2)
+    path = tmp_path / "many.mcap"
+    async with r2p.Module("BOT", via=[]) as bot, Recorder(bot, path, ["value"], types={"value": Led}):
+        for number in range(6):
+            source = r2p.Source("BOT", f"node{number}", "tcp")
+            bot.space.topics["value"].deliver(r2p.Sample(Led(number, 0).encode(), source, 1, sequence=5))
+    with Bag(path) as bag:
+        nodes = [each.sample.source.node for each in bag.records(["value"])]
+    assert nodes == ["node0", "node1", "", "", "", ""]
+
+
+@pytest.mark.virtual_time
+async def test_numbers_that_never_came_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "gaps.mcap"
+    async with r2p.Module("BOT", via=[]) as bot, Recorder(bot, path, ["value"]) as recorder:
+        for number in (7, 8, 11, 12, 1, 2, 4, 0, 0):
+            bot.space.topics["value"].deliver(r2p.Sample(b"1", r2p.Source("A", "b", "tcp"), 1, sequence=number))
+        await asyncio.sleep(1.0)
+        count = recorder.counts()["value"]
+        assert (count.messages, count.dropped, count.missed) == (9, 0, 3)
+    with path.open("rb") as file:
+        losses = [
+            cdr(RecorderLosses).decode(message.data) for _, _, message in make_reader(file).iter_messages([LOSSES])
+        ]
+    assert losses[-1].topics == (TopicLosses("value", 0, 3),)
+    assert losses[-1].messages == 9

@@ -132,6 +132,9 @@ async def record(
     """
     from r2p.recording.recorder import Recorder  # only here, as it takes a while
 
+    if all or topics:
+        with session.waiting("a link"):  # so that there is no file of a network that can't be reached
+            await wait_until(lambda: any(link.up for link in session.module.links), _LINK_UP)
     limits = (max_size, max_duration, split, snapshot, min_free, max_total)
     buses: list[FrameRecorder] = []
     recorder = Recorder(
@@ -150,8 +153,6 @@ async def _record(
     session: Session, recorder: "Recorder", output: Output, topics: list[str], buses: "list[FrameRecorder]"
 ) -> None:
     clock = session.module.space.clock
-    with session.waiting("a link"):  # so that there is no file of a network that can't be reached
-        await wait_until(lambda: any(link.up for link in session.module.links), _LINK_UP)
     began = clock.monotonic()
     try:
         async with recorder:
@@ -176,7 +177,8 @@ async def _print_summary(recorder: "Recorder", buses: "list[FrameRecorder]", out
         counts[each.bus.topic] = TopicCount(each.frames, dropped, each.lost.total())
     total = sum(each.messages - each.dropped for each in counts.values())
     files = ", ".join(map(str, recorder.paths)) or "no file"
-    notify(f"{total} messages in {seconds:.1f} s, {recorder.bytes_written / 1e6:.1f} MB: {files}")
+    what = "snapshots" if recorder.keeps else f"{recorder.bytes_written / 1e6:.1f} MB"
+    notify(f"{total} messages in {seconds:.1f} s; {what}: {files}")
     rows = [{"topic": topic, **msgspec.structs.asdict(each)} for topic, each in counts.items()]
     await output.table(rows, ["topic", "messages", "dropped", "missed"])
 
