@@ -22,6 +22,7 @@ ALL = (
     "timers",
     "start",
     "socketcan",
+    "frames",
 )
 
 

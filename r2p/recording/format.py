@@ -6,7 +6,8 @@
                             Encoding `cdr` with a `ros2msg` schema; `r2p`, without one, if their type is unknown
     channel /r2p/meta/TOPIC its companion, with the same metadata: what of a message is not the default (`SampleMeta`)
     channels /r2p/...       what the recorder saw besides, as the messages of `r2p.recording.messages`
-    channels /BUS/frames    CAN frames, as `can_msgs/msg/Frame`
+    channels /BUS/frames    CAN frames, as `can_msgs/msg/Frame`: one for each direction
+    .../BUS/frames/details  what that has no field for, and frames that were lost: `r2p.recording.frames`
 
 A message's log time is that of its reception, its publish time the stamp of its publisher; without a stamp both are the
 same, and the companion says so. Its sequence has the lowest 32 bits of the publisher's number; where the publisher has

@@ -52,6 +52,20 @@ def is_shareable(via: str) -> bool:
     return via.startswith("sim:") or not colon or interface in _SHARED
 
 
+def frames_of(
+    via: str | SimCan, *, name: str = "", report: Callable[[str], object] | None = None
+) -> "Callable[[object, Callable[[Entry], object]], FrameRecorder]":
+    """Return a part of a `Recorder` that records the frames of a bus beside the topics; arguments as those below.
+
+    Recorder(module, "drive.mcap", parts=[Observations, frames_of("rtcan:can0")])
+    """
+
+    def begin(_module: object, add: Callable[[Entry], object]) -> FrameRecorder:
+        return FrameRecorder(via, lambda entries: [add(each) for each in entries], name=name, report=report)
+
+    return begin
+
+
 class FrameRecorder:
     """Records the frames of one bus while its block runs.
 

@@ -10,8 +10,10 @@ import can
 import pytest
 
 import r2p
+import r2p.sim
 from r2p.bus import FrameKind
 from r2p.clock import clock_of
+from r2p.codecs.can_bits import Frame
 from r2p.errors import BagError, TransportError
 from r2p.msg import Led
 from r2p.recording.bag import Bag
@@ -84,6 +86,21 @@ async def test_frames_of_a_robot_give_a_listening_module_the_same_messages(tmp_p
         assert player.sent == BusReader(bag).counts["lab"] - errors
     assert len(got) > 150
     assert got == expected[-len(got) :]
+
+
+def test_the_same_run_is_the_same_file(tmp_path: Path) -> None:
+    async def run(path: Path) -> None:
+        bus = SimCan(seed=3)
+        a, b = (bus.bus.attach(CanNode(name, drift_ppm=20.0)) for name in "AB")
+        async with recording(path, bus):
+            for number in range(100):
+                a.request(Frame(0x100 + number, b"a"))
+                b.request(Frame(0x180 - number, b"b"))
+                await asyncio.sleep(0.0003)
+
+    r2p.sim.run(lambda: run(tmp_path / "one.mcap"))
+    r2p.sim.run(lambda: run(tmp_path / "two.mcap"))
+    assert (tmp_path / "one.mcap").read_bytes() == (tmp_path / "two.mcap").read_bytes()
 
 
 @pytest.mark.virtual_time

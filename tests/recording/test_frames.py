@@ -2,12 +2,14 @@
 
 import struct
 from io import BytesIO
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from r2p.codecs.can_bits import ERROR, EXTENDED, LOCAL, REMOTE, WireFrame
 from r2p.errors import DecodeError
@@ -73,6 +75,22 @@ def test_mcap_ros2_support_reads_frames() -> None:
     assert (first.id, first.is_extended, first.dlc, bytes(first.data)) == (0x1234567, True, 3, b"abc\0\0\0\0\0")
     assert (second.id, second.is_rtr, second.dlc, second.header.frame_id) == (0x123, True, 4, "can0")
     assert first.header.stamp.sec * 10**9 + first.header.stamp.nanosec == UTC + 5
+
+
+def test_rosbags_reads_frames() -> None:
+    frames = [(EXTENDED | 0x1234567, b"abc", 0, 5), (ERROR | 0x8, b"\0\0\4" + bytes(5), LOCAL, 6)]
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    found: list[Any] = []
+    for schema, _, message in make_reader(written(BusInfo("vcan12"), frames, UTC)).iter_messages():
+        assert schema is not None
+        if schema.name not in store.fielddefs:
+            store.register(get_types_from_msg(schema.data.decode(), schema.name))
+        found.append(store.deserialize_cdr(message.data, schema.name))
+        assert bytes(store.serialize_cdr(found[-1], schema.name)) == message.data
+    assert [(each.id, each.is_error, each.dlc, each.header.frame_id, each.header.stamp.nanosec) for each in found] == [
+        (0x1234567, False, 3, "vcan12", UTC % 10**9 + 5),
+        (0x8, True, 8, "vcan12", UTC % 10**9 + 6),
+    ]
 
 
 @given(data=st.binary(max_size=80))
