@@ -25,7 +25,9 @@ R = TypeVar("R")
 logger = get_logger("r2p.recording")
 
 _LOOK_EVERY: Final = 0.1  # s that the thread waits for entries, at the most
-_SLICE: Final = 1000  # entries between two looks at the time
+_SLICE: Final = 64  # entries, some 0.2 ms, after which the thread lets the event loop go on
+_PAUSE: Final = 100e-6  # s for that: released for less, the interpreter's lock comes straight back
+_HURRY: Final = 16  # the part of the queue's limit, 1/16, from which on there are no pauses
 
 
 class Disk:
@@ -53,6 +55,8 @@ class Disk:
         self._dropping = self._closed = False
         self._put_bytes = self._done_bytes = 0  # each is written by one thread only
         self._jobs: queue.SimpleQueue[tuple[list[Entry], int] | Callable[[], bool]] = queue.SimpleQueue()
+        self._pause = threading.Lock()
+        self._pause.acquire()  # for ever: to wait for it is to release the interpreter's lock
         self._files = RecordingFiles(Path(path), options, clock, self._notify, opened)
         if not self._virtual:
             threading.Thread(target=self._run, name="r2p-disk", daemon=True).start()
@@ -160,6 +164,8 @@ class Disk:
             entries, size = job
             for start in range(0, len(entries), _SLICE):
                 self._write(entries[start : start + _SLICE])
+                if self.queued_bytes < self._limit // _HURRY:
+                    self._pause.acquire(timeout=_PAUSE)
             self._done_bytes += size
 
     def _write(self, entries: list[Entry]) -> None:
