@@ -25,6 +25,7 @@ R = TypeVar("R")
 logger = get_logger("r2p.recording")
 
 _LOOK_EVERY: Final = 0.1  # s that the thread waits for entries, at the most
+_END_REPORT: Final = 5  # s
 _SLICE: Final = 64  # entries, some 0.2 ms, after which the thread lets the event loop go on
 _PAUSE: Final = 100e-6  # s for that: released for less, the interpreter's lock comes straight back
 _HURRY: Final = 16  # the part of the queue's limit, 1/16, from which on there are no pauses
@@ -127,10 +128,14 @@ class Disk:
         return await self._call(self._files.snapshot)
 
     async def close(self) -> None:
-        """Write what waits, and end the file."""
-        if not self._closed:
-            self._closed = True
-            await self._call(self._files.finish, last=True)
+        """Write what waits, and end the file; every few seconds that it takes, say so."""
+        if self._closed:
+            return
+        self._closed = True
+        ending = asyncio.ensure_future(self._call(self._files.finish, last=True))
+        while not (await asyncio.wait((ending,), timeout=_END_REPORT))[0]:
+            self._report(f"the disk is slow: {self.queued_bytes / 1e6:.1f} MB are still to be written")
+        await ending
 
     async def _call(self, function: Callable[[], R], *, last: bool = False) -> R:
         """Call a function in the thread, after all that was put before."""

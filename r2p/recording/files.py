@@ -271,7 +271,8 @@ class RecordingFiles:
             try:
                 return path, self._opened(path)
             except FileExistsError:
-                if not self._numbered or self._number == 1:  # later ones take the next number that is free
+                first = self._number == 1 and not self._options.snapshot
+                if first or not self._numbered:  # others take the next number that is free
                     raise
 
     @property

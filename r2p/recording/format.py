@@ -13,6 +13,11 @@ A message's log time is that of its reception, its publish time the stamp of its
 same, and the companion says so. Its sequence has the lowest 32 bits of the publisher's number; where the publisher has
 none, the recorder counts (`ChannelInfo.numbered`). A record of the companion has the log time and the sequence of its
 message, and stands directly before it.
+
+Schemas and channels stand before the chunks, and chunks have nothing but messages. A chunk ends after half a second at
+the latest, and has an index and a checksum; so have the attachments, the data in front of the summary, and the summary.
+Each file of a recording that was split has all channels, attachments and metadata so far, and the channels have the
+same ids.
 """
 
 from collections.abc import Mapping

@@ -37,6 +37,8 @@ _MESSAGE: Final = struct.Struct("<HIQQ")  # outside of chunks: channel, sequence
 _COMPRESSIONS: Final = b"\4\0\0\0zstd", b"\3\0\0\0lz4"  # with the length in front
 _NAME_AT: Final = RECORD_HEAD.size + 28  # of the compression, with its length, in the record of a chunk
 _FOOTER_BODY: Final = 20  # bytes
+_RECORD_MAX: Final = CHUNK_MAX + (1 << 20)  # bytes of a record; what says that it is longer is damage
+_CUT_MAX: Final = 64 << 20  # bytes up to the end of the file in which a chunk may have been cut
 _PIECE: Final = 1 << 20  # bytes that are searched at once
 _OVERLAP: Final = _NAME_AT + 16  # and as much of the next piece that a chunk at the end is seen
 _ALL_TIMES: Final = 1 << 64
@@ -103,7 +105,7 @@ class RecordingRecovery:
         self.report = RecoveryReport()
         self._schemas: dict[int, Schema] = {}
         self._crc: int | None = zlib.crc32(MAGIC)  # of all records so far; None behind damage
-        self._ended = False
+        self._in_summary = self._ended = False
         self._writer = BagWriter(target, about={}, profile=self._profile())
 
     def run(self) -> Iterator[RecoveryReport]:
@@ -166,18 +168,20 @@ class RecordingRecovery:
         """Return the opcode and the content of the record that begins here, if all of it is there."""
         try:
             opcode, length = self._source.head(position)
-            return (opcode, self._source.read(position + RECORD_HEAD.size, length)) if opcode else None
+            if not opcode or length > _RECORD_MAX:
+                return None
+            return opcode, self._source.read(position + RECORD_HEAD.size, length)
         except BagError:
             return None
 
     def _behind_damage(self, position: int) -> int:
         """Return where the next chunk begins, and write what is left of a chunk that was cut off here."""
-        begin = position + RECORD_HEAD.size
-        if self._read(position, 1) == bytes((Opcode.CHUNK,)):
+        if self._source.size - position <= _CUT_MAX and self._read(position, 1) == bytes((Opcode.CHUNK,)):
             with contextlib.suppress(Exception):  # each library has its own errors
-                self._messages(unpacked_to_cut(self._read(begin, CHUNK_MAX)))
+                self._messages(unpacked_to_cut(self._read(position + RECORD_HEAD.size, _CUT_MAX)))
         end = self._next_chunk(position + 1)
-        self.report.unreadable += end - position
+        if not self._in_summary:  # of which a new one is made
+            self.report.unreadable += end - position
         return end
 
     def _next_chunk(self, position: int) -> int:
@@ -218,6 +222,7 @@ class RecordingRecovery:
                     self._writer.register(parse(Metadata, content))
                 case Opcode.DATA_END:
                     _check_crc(int.from_bytes(content[:4], "little"), self._crc)
+                    self._in_summary = True
                 case Opcode.FOOTER:
                     self._ended = self._is_end(parse(Footer, content), position)
         except (BagError, DecodeError, struct.error):

@@ -142,7 +142,9 @@ class BagWriter:
         self.register(Metadata(name, dict(values)))
 
     def register(self, record: McapRecord) -> None:
-        """Write a record that each file of the recording has, such as an attachment of another file."""
+        """Write a record that each file of the recording has; of attachments and metadata of one name, the last."""
+        if isinstance(record, Attachment | Metadata):
+            self.registered = [each for each in self.registered if not _replaces(record, each)]
         self.registered.append(record)
         self._append(record)
 
@@ -176,6 +178,10 @@ class BagWriter:
         self.end_chunk()
         if self._file is not None:
             self._file.finish()
+
+
+def _replaces(new: Attachment | Metadata, old: McapRecord) -> bool:
+    return isinstance(old, type(new)) and old.name == new.name
 
 
 def _pairs(index: list[int]) -> bytes:
