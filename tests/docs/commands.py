@@ -11,6 +11,7 @@ def commands() -> Iterator[tuple[str, Any]]:
     for name in main.GROUPS | main.COMMANDS:
         command = main._load(name)
         if name in main.GROUPS:
-            yield from ((f"r2p {name} {inner}", each) for inner, each in command.commands.items())
+            load = getattr(command, "load", command.commands.get)  # of a group that imports its commands when called
+            yield from ((f"r2p {name} {inner}", load(inner)) for inner in command.commands)
         else:
             yield f"r2p {name}", command

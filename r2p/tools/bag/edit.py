@@ -33,9 +33,10 @@ async def cut(
     ] = False,
     format: Format = None,
 ) -> None:
-    """Write a part of a recording into a new file: r2p bag cut drive.mcap --start 14:03 --end 14:04 -o crash.mcap.
+    """Write a part of a recording into a new file.
 
-    Without -o the new file is FILE-cut.mcap. The messages at the very end of --end are not in it.
+    For example r2p bag cut drive.mcap --start 14:03 --end 14:04 -o crash.mcap. Without -o the new file is
+    FILE-cut.mcap. A message that was received at the very instant of --end is not in it.
     """
     from r2p.recording.editing import cut as steps
 

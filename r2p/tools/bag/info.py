@@ -30,7 +30,7 @@ async def info(
     all: Annotated[bool, typer.Option("--all", "-a", help="Count all losses, also in large recordings.")] = False,
     format: Format = None,
 ) -> None:
-    """Show what is in a recording: its length, topics, other channels, and what was lost.
+    """Show what is in a recording, and what was lost.
 
     The rate of a topic is that between its first and its last message. CSV has the topics.
     """

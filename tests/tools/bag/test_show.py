@@ -11,13 +11,12 @@ from r2p.messages import Message
 from r2p.recording.entries import EntryWriter, MessageEntry
 from r2p.recording.messages import EVENTS, SIGNALS, RecordedEvent, RecordedSignal
 from r2p.recording.writer import BagWriter
+from r2p.tools import main
 from r2p.tools.bag.echo import echo
 from r2p.tools.bag.info import info
 from r2p.tools.bag.times import moment
 from r2p.tools.session import UsageError
 from tests.recording.making import MS, T0, led, leds, write
-
-pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture
@@ -51,6 +50,7 @@ def observed(path: Path, messages: list[tuple[str, Message]]) -> Path:
     return path
 
 
+@pytest.mark.anyio
 async def test_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "drive.mcap", [*leds(9), ("raw", led(20), None, T0 + 20 * MS)])
     await info(path)
@@ -80,6 +80,7 @@ async def test_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert found["losses"] == []
 
 
+@pytest.mark.anyio
 async def test_info_at_a_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -95,6 +96,7 @@ async def test_info_at_a_terminal(
     ]
 
 
+@pytest.mark.anyio
 async def test_info_has_losses_by_cause(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     messages: list[tuple[str, Message]] = [(SIGNALS, each) for each in SIGNALS_OF_LEDS]
     messages += [(EVENTS, each) for each in EVENTS_OF_LINKS]
@@ -109,6 +111,7 @@ async def test_info_has_losses_by_cause(tmp_path: Path, capsys: pytest.CaptureFi
     assert [each["channel"] for each in found["channels"]] == [EVENTS, SIGNALS]
 
 
+@pytest.mark.anyio
 async def test_info_of_a_file_that_is_being_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "drive.mcap", leds(9), finish=False)
     await info(path)
@@ -117,6 +120,7 @@ async def test_info_of_a_file_that_is_being_written(tmp_path: Path, capsys: pyte
     assert found["problems"][0].endswith(f"r2p bag recover {path} makes a whole file of it")
 
 
+@pytest.mark.anyio
 async def test_echo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "drive.mcap", [*leds(9), ("raw", led(20), None, T0 + 20 * MS)])
     await echo(path, ["leds"], start=moment("2ms"), end=moment("4ms"))
@@ -130,6 +134,7 @@ async def test_echo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ]
 
 
+@pytest.mark.anyio
 async def test_echo_filters_and_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "drive.mcap", leds(9))
     await echo(path, filter="led > 5", once=True)
@@ -146,6 +151,7 @@ async def test_echo_filters_and_counts(tmp_path: Path, capsys: pytest.CaptureFix
         await echo(path, type="Odometry")
 
 
+@pytest.mark.anyio
 async def test_echo_of_bytes_and_of_other_channels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     await echo(write(tmp_path / "drive.mcap", [("raw", led(4), None, T0)]))
     captured = capsys.readouterr()
@@ -155,6 +161,7 @@ async def test_echo_of_bytes_and_of_other_channels(tmp_path: Path, capsys: pytes
     assert [each["kind"] for each in printed(capsys)] == ["link down", "link down", "link up"]
 
 
+@pytest.mark.anyio
 async def test_echo_as_csv_has_one_header_for_all_topics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "drive.mcap", [*leds(1), ("raw", led(4), None, T0)])
     await echo(path, meta=True, format="csv")
@@ -162,3 +169,9 @@ async def test_echo_as_csv_has_one_header_for_all_topics(tmp_path: Path, capsys:
     assert lines[0] == "topic,led,value,_.topic,_.stamp,_.stamp_from,_.source,_.sequence,data,_.received"
     assert lines[1].startswith("raw,,,raw,")
     assert lines[1].endswith(f",4,0400000001,{T0}")
+
+
+def test_the_list_of_commands_says_of_each_what_its_own_help_says() -> None:
+    group = main._load("bag")
+    for name, stub in group.commands.items():
+        assert stub.help == group.load(name).help.splitlines()[0]
