@@ -209,11 +209,6 @@ def __getattr__(name: str) -> object:
     """Return what a program uses of recordings. Raises BagError if the extra is not installed."""
     if name not in _OF_RECORDINGS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
-        found: object = getattr(importlib.import_module(_OF_RECORDINGS[name]), name)
-    except ModuleNotFoundError as error:
-        if error.name != "mcap":
-            raise
-        raise BagError("recordings need mcap: pip install 'r2p[bag]'") from error
+    found: object = getattr(importlib.import_module(_OF_RECORDINGS[name]), name)
     globals()[name] = found
     return found

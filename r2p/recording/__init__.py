@@ -1,8 +1,18 @@
 """Recordings ("bags"): MCAP files with messages, CAN frames, and what happened to them on their way.
 
 `format` says what is in a file: start there. `samples` turns samples into records and back, with the classes of `types`
-and the messages of `messages`; `writer` writes the records, and `bag` reads them. `recorder` subscribes to
-topics and records them.
-`player` publishes what is in a bag, by the publishers
-of `played`, at the times that `pacing` keeps.
+and the messages of `messages`; `writer` writes the records, and `bag` reads them.
+
+A `recorder` subscribes to topics (`topics`), and hands what they receive to the thread of `disk`; `observations` and
+`frame_recorder` are its other parts. `player` publishes what is in a bag, by the publishers of `played`, at the times
+that `pacing` keeps.
+
+Raises BagError on import where the extra is not installed.
 """
+
+import importlib.util
+
+from r2p.errors import BagError
+
+if importlib.util.find_spec("mcap") is None:
+    raise BagError("recordings need mcap: pip install 'r2p[bag]'")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -208,3 +210,19 @@ async def test_numbers_that_never_came_are_counted(tmp_path: Path) -> None:
         ]
     assert losses[-1].topics == (TopicLosses("value", 0, 3),)
     assert losses[-1].messages == 9
+
+
+@pytest.mark.processes
+def test_only_what_records_loads_recordings_and_without_the_extra_it_says_so() -> None:
+    code = """
+import sys
+import r2p, r2p.tools.bag, r2p.tools.gateway, r2p.tools.run, r2p.tools.topic
+print([name for name in sys.modules if "mcap" in name or "r2p.recording" in name])
+sys.modules["mcap"] = None
+sys.argv = ["r2p", "bag", "record", "-a", "--via", "memory:lab"]
+from r2p.tools.main import main
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (1, "[]\n")
+    assert done.stderr == "r2p: recordings need mcap: pip install 'r2p[bag]'\n"
