@@ -19,6 +19,7 @@ from typing import Self
 import msgspec
 
 from r2p.clock import Alarm
+from r2p.codecs.services import REQUESTS, RESPONSES
 from r2p.errors import Closed, Error, InvalidName
 from r2p.log_lines import get_logger
 from r2p.messages import Message
@@ -280,6 +281,8 @@ class Recorder:
     def _record(self, name: str) -> None:
         topic = self._topics[name] = RecordedTopic(self._node, name, self._types, self._entries.append)
         topic.open()
+        if name.endswith(RESPONSES):  # a server is there: the first request comes with its topic
+            self._consider(name.removesuffix(RESPONSES) + REQUESTS)
 
     def _hand_over(self) -> None:
         if self._entries:
