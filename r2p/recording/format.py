@@ -3,7 +3,8 @@
     metadata record `r2p`   `format`: FORMAT; `r2p`: the version of r2p that wrote the file
     metadata `r2p/latched`  a key for each topic that its publisher latches; of several such records, the last counts
     channel /TOPIC          the messages of one publisher, in one class, by one link: `ChannelInfo` in its metadata.
-                            Encoding `cdr` with a `ros2msg` schema; `r2p`, without one, if their type is unknown
+                            Encoding `cdr` with a `ros2msg` schema; `r2p`, without one, if their type is unknown, or
+                            one that ROS can't define
     channel /r2p/meta/TOPIC its companion, with the same metadata: what of a message is not the default (`SampleMeta`)
     channels /r2p/...       what the recorder saw besides, as the messages of `r2p.recording.messages`
     channels /BUS/frames    CAN frames, as `can_msgs/msg/Frame`: one for each direction
