@@ -24,6 +24,7 @@ from r2p.recording.messages import (
     PARAMETERS,
     SIGNALS,
     SLOTS,
+    STATISTICS,
     LogRecord,
     ParameterValue,
     RecordedEvent,
@@ -60,6 +61,8 @@ _KIND_OF_EVENT = {"no answer": "module", "answers": "module", "no master": "mast
 _BASELINE = 11 * SECOND  # tables of slots are repeated every ten seconds
 _TOGETHER = SECOND  # ns in which the same happenings are joined
 _LOGGED_MISS = re.compile(r"topic (\S+)(?: \(.*?\))?: (.+) \(missed \d+, late \d+ so far\)")
+
+_DELAY = re.compile(r" by [\d.]+ ms$")
 
 
 class Happening(msgspec.Struct, frozen=True, kw_only=True):
@@ -147,6 +150,7 @@ def _event_text(event: RecordedEvent) -> str:
 
 def _misses(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
     reasons: dict[tuple[str, str], tuple[int, str]] = {}  # by module and topic: when it was logged, and what
+    counted = {each.name.removeprefix(f"{STATISTICS}/") for each in bag.channels}
     logged = ((each.time, each) for each in _log(bag, start, end))
     signals = ((each.log_time, each.message) for each in bag.messages(SIGNALS, RecordedSignal, start=start, end=end))
     merged: Iterator[tuple[int, Happening | RecordedSignal]] = heapq.merge(logged, signals, key=itemgetter(0))
@@ -154,10 +158,11 @@ def _misses(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
         if isinstance(each, RecordedSignal):
             yield _signal(time, each, reasons)
             continue
-        found = _LOGGED_MISS.search(each.text)
+        found, module = _LOGGED_MISS.search(each.text), each.about.rpartition("/")[0]
         if found is not None:
-            reasons[each.about.rpartition("/")[0], found[1]] = time, found[2]
-        yield each
+            reasons[module, found[1]] = time, _DELAY.sub("", found[2])
+        if found is None or module not in counted:  # else it is there as what the module has counted
+            yield each
 
 
 def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tuple[int, str]]) -> Happening:

@@ -18,6 +18,7 @@ from r2p.recording.messages import (
     PARAMETERS,
     SIGNALS,
     SLOTS,
+    STATISTICS,
     LogRecord,
     ParameterValue,
     RecordedEvent,
@@ -81,7 +82,9 @@ ENTRIES: list[BagEntry] = [
     *(missed(12 + number / 100, number) for number in range(1, 5)),
     at(12.5, SIGNALS, signal("degraded", "link down", "tcp")),
     missed(13.5, 9, late=0.004),
-    log(14.0, logging.WARNING, "topic grip (tcp:): no room by the deadline (missed 2, late 0 so far)"),
+    at(13.9, f"{STATISTICS}/ARM", r2p.ModuleStatistics()),
+    log(14.0, logging.WARNING, "topic grip (tcp:): no room by the deadline by 1.5 ms (missed 2, late 0 so far)"),
+    log(14.0, logging.WARNING, "the motor is hot"),
     log(14.1, logging.INFO, "all is well"),
     counted(14.5, 2),
     counted(14.6, 3, "other"),
@@ -102,7 +105,7 @@ LINES = """
 22:13:32.010 missed    steer of ROBOT/control: no room by the deadline (tcp), 4 until 22:13:32.040
 22:13:32.500 degraded  steer of ROBOT/control: link down (tcp)
 22:13:33.500 missed    steer of ROBOT/control: no room by the deadline (tcp), 4.0 ms late, message 9
-22:13:34.000 log       ARM/reach: WARNING: topic grip (tcp:): no room by the deadline (missed 2, late 0 so far)
+22:13:34.000 log       ARM/reach: WARNING: the motor is hot
 22:13:34.500 missed    grip of ARM/reach: no room by the deadline, as it logged, 2 messages
 22:13:34.600 missed    other of ARM/reach: as it counted, 3 messages
 22:13:35.100 overdue   leds of ARM/blink: received after its deadline, 3.2 ms late, message 8

@@ -89,7 +89,7 @@ def _summarise(bag: "Bag", counts: dict[str, int], first: int | None, last: int 
         notify(f"{when}: {misses}")
     elif not counts:
         observed = any(each.name.startswith("/r2p/events") for each in bag.channels)
-        why = "" if observed else ": this recording has only messages, made by another program, or without its events"
+        why = "" if observed else ": this recording has only messages, made with --no-events, or by another program"
         notify(f"nothing {when}{why}")
 
 

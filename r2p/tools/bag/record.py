@@ -91,6 +91,7 @@ _Output = Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE", 
 _Exclude = Annotated[
     list[str] | None, typer.Option("--exclude", metavar="PATTERN", help="Leave these topics out (repeatable).")
 ]
+_NoEvents = Annotated[bool, typer.Option("--no-events", help="Only messages: no links, misses, slots, parameters.")]
 _Frames = Annotated[bool, typer.Option("--frames", help="All frames of the CAN buses of --via, too.")]
 _StatedTypes = Annotated[
     list[str] | None,
@@ -114,6 +115,7 @@ async def record(
     all: _All = False,
     output: _Output = None,
     exclude: _Exclude = None,
+    no_events: _NoEvents = False,
     frames: _Frames = False,
     type: _StatedTypes = None,
     max_size: Annotated[int | None, _size("--max-size", "End at this size: 500M, 2G.")] = None,
@@ -144,7 +146,7 @@ async def record(
         exclude=exclude or (),
         types=_stated_types(session.settings, topics, type),
         options=_options(dict(zip(_LIMITS, limits, strict=True))),
-        parts=_parts(session.settings, buses if frames else None),
+        parts=_parts(session.settings, buses if frames else None, events=not no_events),
     )
     await _record(session, recorder, Output(format), topics or [], buses)
 
@@ -253,7 +255,7 @@ def _buses(settings: Settings) -> list[str]:
     return [url for url in settings.via if url.startswith(CAN_SCHEMES)]
 
 
-def _parts(settings: Settings, buses: "list[FrameRecorder] | None") -> "list[Part]":
+def _parts(settings: Settings, buses: "list[FrameRecorder] | None", *, events: bool) -> "list[Part]":
     """Return what is recorded besides topics: what happens on the network, r2p.toml, and frames.
 
     The recorders of frames enter `buses`; None: no frames.
@@ -273,8 +275,8 @@ def _parts(settings: Settings, buses: "list[FrameRecorder] | None") -> "list[Par
 
         return begin
 
-    observations: Part = functools.partial(Observations, files=files)
-    return [observations, *(of_bus(url) for url in _buses(settings) if buses is not None)]
+    observations: list[Part] = [functools.partial(Observations, files=files)] if events else []
+    return [*observations, *(of_bus(url) for url in _buses(settings) if buses is not None)]
 
 
 def _options(limits: Mapping[str, Any]) -> "RecordingOptions":

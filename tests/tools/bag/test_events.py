@@ -1,5 +1,6 @@
 """`r2p bag events` and `r2p bag slots`."""
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Any
@@ -7,10 +8,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+import r2p
 from r2p.msg import Led
 from r2p.recording.entries import MessageEntry
+from r2p.tools.bag.record import record
 from r2p.tools.main import app
 from tests.recording.test_timeline import START, bag_of, path, utc
+from tests.tools.rig import robot, tool
 
 __all__ = ["path", "utc"]  # fixtures
 
@@ -71,3 +75,19 @@ def test_slots_at_a_time_outside_of_the_recording(path: Path) -> None:
     result = called("slots", path, "--at", "1h")
     assert result.exit_code == 2
     assert "--at 1h: the recording is from 2023-11-14 22:13:20.000 to" in " ".join(result.stderr.split())
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("no_events", [False, True])
+async def test_events_can_be_left_out(tmp_path: Path, no_events: bool) -> None:
+    async with robot(), tool() as session:
+        task = asyncio.create_task(
+            record(session, all=True, output=tmp_path / "drive.mcap", no_events=no_events, min_free=0)
+        )
+        await asyncio.sleep(2.0)
+        task.cancel()
+        await asyncio.wait([task])
+    with r2p.Bag(tmp_path / "drive.mcap") as bag:
+        channels = {each.name for each in bag.channels}
+    assert ({"/r2p/events", "/r2p/statistics/BOT"} <= channels) is not no_events
+    assert "/r2p/recorder" in channels
