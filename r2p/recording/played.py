@@ -52,6 +52,11 @@ class PlayedPublisher:
             queue.publisher_joined()
         space.changed(topic)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether messages wait for room."""
+        return bool(self._pending)
+
     def play(self, sample: Sample) -> None:
         """Publish a sample that has its number (`sent`) and its stamp."""
         if self.latch:

@@ -19,7 +19,7 @@ from r2p.names import BUS_LOAD, BUS_SLOTS, LOADER_PREFIX, LOG, NODE_MAX, RESERVE
 from r2p.protocols.discovery.events import TopicType
 from r2p.recording.bag import Bag, RecordedSample
 from r2p.recording.channels import BagChannel
-from r2p.recording.format import LATCHED, ChannelInfo
+from r2p.recording.format import ChannelInfo
 from r2p.recording.pacing import PacedStream, Pacer
 from r2p.recording.played import PlayedPeriodic, PlayedPublisher, period_of
 from r2p.ros.clock import PERIOD, TOPIC, RosClock
@@ -137,7 +137,7 @@ class Player:
         self._publishers: dict[Publication, PlayedPublisher] = {}
         self._closing = contextlib.ExitStack()
         self._stream: PacedStream[RecordedSample] | None = None
-        self._latched = set(bag.metadata.get(LATCHED, ()))
+        self._latched = bag.latched
 
     # What is played
 
@@ -204,6 +204,11 @@ class Player:
             if each.missed:
                 found.setdefault(each.topic.name, Counter()).update(each.missed)
         return found
+
+    @property
+    def waiting(self) -> bool:
+        """Whether messages that were played still wait for room."""
+        return any(each.waiting for each in self._publishers.values())
 
     @property
     def subscribed(self) -> list[str]:

@@ -4,7 +4,7 @@ Each is a type for a parameter of a command, as Typer reads it: `async def echo(
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -134,3 +134,16 @@ def topic_pairs(given: list[str] | None, option: str, form: str) -> Iterator[tup
         if not (topic and equals and value):
             raise UsageError(f"{option} {text}: write it as {form}")
         yield topic_pattern(topic.removeprefix("/"), option), value
+
+
+def parse_remap(remap: Iterable[str]) -> dict[str, str]:
+    """Return the other names of topics in OLD:=NEW. Raises UsageError."""
+    names: dict[str, str] = {}
+    for each in remap:
+        old, found, new = each.partition(":=")
+        if not found:
+            raise UsageError(f"--remap {each}: write it as OLD:=NEW, for example encoder:=encoder1")
+        topic, other = topic_name(old), topic_name(new)
+        if names.setdefault(topic, other) != other:
+            raise UsageError(f"--remap renames {topic} twice, to {names[topic]} and to {other}: leave out one of them")
+    return names

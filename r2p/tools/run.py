@@ -26,10 +26,10 @@ import typer
 import r2p
 from r2p.codecs.parameters import Origin
 from r2p.log_lines import internal
-from r2p.names import NODE_MAX, module_name_from, node_name, topic_name
+from r2p.names import NODE_MAX, module_name_from, node_name
 from r2p.parameters.sources import ParameterSource, from_options, of_module, read_file
 from r2p.tools.config import Settings
-from r2p.tools.options import Param, Params, ParamsFile, Via
+from r2p.tools.options import Param, Params, ParamsFile, Via, parse_remap
 from r2p.tools.output import notify
 from r2p.tools.session import Run, UsageError, check_urls, run_virtually, service, settings
 
@@ -105,7 +105,7 @@ async def command(
         raise UsageError("--load-dir says where the code for --allow-load is: give that, too")
     chosen = settings(via)
     check_urls(chosen.via, chosen.via_source)
-    names = chosen.remap | _parse_remap(remap or ())
+    names = chosen.remap | parse_remap(remap or ())
     programs = load(functions or ())
     priorities = _parse_priorities(priority or (), programs)
     name = module or chosen.module or module_name_from(socket.gethostname())
@@ -204,18 +204,6 @@ def _functions(module: ModuleType) -> list[str]:
         for name, value in vars(module).items()
         if inspect.iscoroutinefunction(value) and value.__module__ == module.__name__
     ]
-
-
-def _parse_remap(remap: Iterable[str]) -> dict[str, str]:
-    names: dict[str, str] = {}
-    for each in remap:
-        old, found, new = each.partition(":=")
-        if not found:
-            raise UsageError(f"--remap {each}: write it as OLD:=NEW, for example encoder:=encoder1")
-        topic, other = topic_name(old), topic_name(new)
-        if names.setdefault(topic, other) != other:
-            raise UsageError(f"--remap renames {topic} twice, to {names[topic]} and to {other}: leave out one of them")
-    return names
 
 
 def _parse_priorities(priority: Iterable[str], programs: list[Program]) -> dict[str, int]:

@@ -432,7 +432,7 @@ def joined(
                 if opening is not None or keep_trying:
                     await body(opened, **given)
                 else:
-                    await _while_connected(opened, body(opened, **given))
+                    await while_connected(opened, body(opened, **given))
 
         execute(main, verbose=verbose, quiet=quiet, endless=endless(given))
 
@@ -440,16 +440,21 @@ def joined(
 
 
 def standalone(
-    body: Callable[..., Awaitable[None]], *, endless: bool = False, loop: Callable[..., Run | None] | None = None
+    body: Callable[..., Awaitable[None]],
+    *,
+    endless: bool | Endless = False,
+    loop: Callable[..., Run | None] | None = None,
 ) -> Callable[..., None]:
     """Make a command for `main.COMMANDS` of a coroutine function that joins no network as a tool; it adds -v and -q.
 
-    `loop` returns what replaces `r2p.run_main`, for the command's arguments.
+    `endless`: whether it goes on until a signal ends it, or a function that says so of its arguments. `loop` returns
+    what replaces `r2p.run_main`, for the command's arguments.
     """
 
     def run(*, verbose: int, quiet: int, **given: Any) -> None:
         replaced = None if loop is None else loop(**given)
-        execute(functools.partial(body, **given), verbose=verbose, quiet=quiet, endless=endless, run=replaced)
+        is_endless = endless(given) if callable(endless) else endless
+        execute(functools.partial(body, **given), verbose=verbose, quiet=quiet, endless=is_endless, run=replaced)
 
     return _with_options(run, body, session=False)
 
@@ -485,8 +490,8 @@ def _with_options(run: Callable[..., None], body: Callable[..., object], *, sess
     return run
 
 
-async def _while_connected(session: Session, body: Awaitable[None]) -> None:
-    """Run a command. Raises r2p.TransportError if no link can come up."""
+async def while_connected(session: Session, body: Awaitable[None]) -> None:
+    """Run a command on the network. Raises r2p.TransportError if no link can come up."""
     async with asyncio.TaskGroup() as tasks:
         watching = [tasks.create_task(session.fail_unless_connected()), tasks.create_task(session.fail_without_key())]
         await body

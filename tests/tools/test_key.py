@@ -12,7 +12,7 @@ import r2p
 from r2p import keys
 from r2p.tools.key import app
 from r2p.tools.module import reboot
-from r2p.tools.session import Settings, _while_connected, join
+from r2p.tools.session import Settings, join, while_connected
 from r2p.transports.tcp import TcpListenTransport
 from r2p.transports.url import parse
 from tests.transports.cables import GUARD
@@ -64,6 +64,6 @@ async def test_a_tool_without_the_key_of_a_server_ends_with_the_reason(
         url = f"tcp:127.0.0.1:{server.port}" + (new_key(tmp_path / "other.key") if given else "")
         with pytest.raises(BaseExceptionGroup) as raised:
             async with join(Settings(via=[url])) as session:
-                await _while_connected(session, asyncio.get_running_loop().create_future())
+                await while_connected(session, asyncio.get_running_loop().create_future())
     assert raised.group_contains(r2p.TransportError, match=f"no connection on {url}".replace("?", r"\?"))
     assert ("the other end has another key" if given else "the other end wants a key") in caplog.text

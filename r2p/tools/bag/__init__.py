@@ -1,7 +1,8 @@
 """`r2p bag`: recordings of topics, CAN frames and what happened to them, in files.
 
 `record` writes a file, and `convert` makes files of other formats of it, and it of those. `info`, `echo` and `frames`
-show what is in one; `edit` has `cut` and `merge`, and `recover` makes a file whole that was cut off.
+show what is in one; `edit` has `cut` and `merge`, and `recover` makes a file whole that was cut off. `play`
+publishes what was recorded, with the keys of `controls`.
 
 Each is imported when it is called: all of them would take longer than to show what is in a recording.
 """
@@ -21,6 +22,12 @@ def _record(app: typer.Typer) -> None:
     body(record.record)
 
 
+def _play(app: typer.Typer) -> None:
+    from r2p.tools.bag import play
+
+    app.command("play")(session.standalone(play.play, endless=lambda given: bool(given["loop"])))
+
+
 def _alone(module: str, name: str) -> Register:
     """Return what makes a function of a module a command that joins no network."""
 
@@ -33,6 +40,7 @@ def _alone(module: str, name: str) -> Register:
 
 COMMANDS: dict[str, tuple[str, Register]] = {
     "record": ("Record topics into a file, until Ctrl-C.", _record),
+    "play": ("Publish the messages of a recording at their times.", _play),
     "info": ("Show what is in a recording, and what was lost.", _alone("info", "info")),
     "echo": ("Print the messages of a recording, as r2p topic echo does.", _alone("echo", "echo")),
     "events": ("Print what happened: links, elections, slots, missed deadlines.", _alone("events", "events")),
