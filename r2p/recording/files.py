@@ -26,6 +26,7 @@ _CHUNK_EVERY: Final = 500 * MILLISECOND  # ns after which messages go to the ope
 _SYNC_EVERY: Final = SECOND  # ns after which they have to be on the disk
 _FULL: Final = frozenset((errno.ENOSPC, errno.EDQUOT, errno.EFBIG))
 _RING_MAX: Final = 1 << 30  # bytes in memory for a snapshot, unless max_size says otherwise
+_GB: Final = 1_000_000_000
 _FILES_OF_TOTAL: Final = 10  # files that share max_total, where nothing else says when a file ends
 
 
@@ -137,14 +138,15 @@ class RecordingFiles:
         self._raw: BinaryIO | None = None
         self._file: McapFile | None = None
         if (free := self._free()) < options.min_free:
-            raise Error(f"only {_mb(free)} are free for {path}, and min_free is {_mb(options.min_free)}")
+            raise Error(f"{path} has only {_size(free)} of disk: {_size(options.min_free)} are to stay free (min_free)")
         if not options.snapshot:
             self._open()
 
     @property
     def bytes_written(self) -> int:
         """Bytes in all files, those included that were deleted."""
-        return self.finished_bytes + (self._file.size if self._file else 0)
+        file = self._file  # once: another thread asks
+        return self.finished_bytes + (0 if file is None else file.size)
 
     # Entries
 
@@ -198,7 +200,7 @@ class RecordingFiles:
     def _check_free(self) -> None:
         while self._options.min_free and self._free() < self._options.min_free:
             if not self._delete_oldest():
-                self.fail(f"less than {_mb(self._options.min_free)} are free on the disk (min_free)")
+                self.fail(f"less than {_size(self._options.min_free)} are free on the disk (min_free)")
                 return
 
     # Out to the disk
@@ -211,7 +213,7 @@ class RecordingFiles:
         while ready and self._file is not None:
             item = ready[0]
             if isinstance(item, PackedChunk) and self._over(item):
-                self._limit_reached(f"max_size ({_mb(self._options.file_size)})")
+                self._limit_reached(f"max_size ({_size(self._options.file_size)})")
                 continue
             try:
                 self._file.write(item)
@@ -437,8 +439,8 @@ def _sync_directory(path: Path) -> None:
             os.close(directory)
 
 
-def _mb(count: int) -> str:
-    return f"{count / 1e6:.4g} MB"
+def _size(count: int) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= _GB else f"{count / 1e6:.4g} MB"
 
 
 def _reason(error: OSError) -> str:

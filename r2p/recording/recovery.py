@@ -18,6 +18,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema
 
 from r2p.errors import BagError, DecodeError
+from r2p.recording.format import META_PREFIX
 from r2p.recording.records import (
     CHUNK_MAX,
     MAGIC,
@@ -47,9 +48,9 @@ _ALL_TIMES: Final = 1 << 64
 class RecoveryReport(msgspec.Struct):
     """What was found in a file. `start` and `end` are the log times of its messages (UTC, ns; 0 without messages).
 
-    `unreadable`: bytes that belong to nothing whole; `damaged`: chunks and records whose checksum or content is wrong;
-    `without_channel`: messages whose channel is not in the file any more. `complete`: nothing is missing, so the file
-    needs no recovery.
+    Companions of messages are not counted. `unreadable`: bytes that belong to nothing whole; `damaged`: chunks and
+    records whose checksum or content is wrong; `without_channel`: messages whose channel is not in the file any more.
+    `complete`: nothing is missing, so the file needs no recovery.
     """
 
     messages: int = 0
@@ -104,6 +105,7 @@ class RecordingRecovery:
         self._source = source
         self.report = RecoveryReport()
         self._schemas: dict[int, Schema] = {}
+        self._companions: set[int] = set()
         self._crc: int | None = zlib.crc32(MAGIC)  # of all records so far; None behind damage
         self._in_summary = self._ended = False
         self._writer = BagWriter(target, about={}, profile=self._profile())
@@ -234,6 +236,8 @@ class RecordingRecovery:
         if schema is None:
             channel = replace(channel, schema_id=0)
         self._writer.copy_channel(channel, schema)
+        if channel.topic.startswith(META_PREFIX):
+            self._companions.add(channel.id)
 
     def _attachment(self, content: bytes) -> None:
         _check_crc(int.from_bytes(content[-4:], "little"), zlib.crc32(content[:-4]))
@@ -273,7 +277,7 @@ class RecordingRecovery:
             report.without_channel += 1
             return
         self._writer.add(channel, log_time, publish_time, sequence, data)
-        report.messages += 1
+        report.messages += channel not in self._companions
         report.start = min(report.start, log_time)
         report.end = max(report.end, log_time)
 

@@ -70,7 +70,7 @@ def _remarks(report: "RecoveryReport") -> Iterator[str]:
     if report.unreadable:
         yield f"{report.unreadable} bytes could not be read, as it was cut off or is damaged"
     elif not report.damaged:
-        yield "its end was missing; no message is lost that was in it"
+        yield "its end is missing; all messages that were in it are recovered"
     if report.damaged:
         yield f"{report.damaged} damaged parts are left out"
     if report.without_channel:
