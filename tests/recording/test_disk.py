@@ -292,7 +292,7 @@ async def test_a_disk_that_fills_up_ends_the_recording_before_it_is_full(
     assert reports == [f"the recording ended: {disk.stopped}"]
     found = sequences(*disk.paths)
     assert disk.lost == {"leds": 1_000 - len(found)}
-    with pytest.raises(r2p.Error, match="only 1.98 MB of disk: 2 MB are to stay free"):
+    with pytest.raises(r2p.Error, match=r"only 1\.98 MB of disk: 2 MB are to stay free"):
         open_disk(tmp_path / "more.mcap", min_free=2_000_000)
 
 
