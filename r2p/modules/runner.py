@@ -1,7 +1,8 @@
 """Run a program: on the fastest event loop available, with signals that end everything in order.
 
 The first SIGINT or SIGTERM cancels the program: it ends its nodes, says good-bye on its links, and returns. A second
-one ends the process at once, as does the first one if the program is still running GRACE seconds later.
+one ends the process at once, as does the first one if the program is still running GRACE seconds later; the time in
+which it saves something (`saving`) does not count.
 
 A program that `run` starts logs to stderr unless it has configured logging. Where nothing catches what `run` raises,
 Python prints it as one line: what crashed is in the log already, and a wrong name or URL is not in the stack. What
@@ -17,7 +18,7 @@ import signal
 import sys
 import threading
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from types import FrameType, TracebackType
 from typing import Any, Self, TypeVar
 
@@ -33,6 +34,11 @@ T = TypeVar("T")
 
 GRACE = 1.8
 """Seconds that a program has to end in order: with the interpreter's own end, the process is gone after two."""
+SAVING_MAX = 30.0
+"""Seconds that it may take beyond that to save what would be lost."""
+
+_STEP = 0.1  # seconds between two looks whether something is still being saved
+_saving: list[None] = []  # an entry for each block of `saving`
 
 
 def run(
@@ -169,6 +175,16 @@ def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
         raise
 
 
+@contextlib.contextmanager
+def saving() -> Iterator[None]:
+    """Let the program take longer to end after a signal, up to SAVING_MAX, while the block saves what it would lose."""
+    _saving.append(None)
+    try:
+        yield
+    finally:
+        _saving.pop()
+
+
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
     """Return uvloop's loop factory, if uvloop is installed; otherwise None, which means asyncio's own."""
     try:
@@ -223,5 +239,9 @@ class _Signals:
 
     def _enforce(self) -> None:
         self._over.wait()
-        if self.received and not self._ended.wait(GRACE):
-            os.kill(os.getpid(), self.received[0])
+        left, left_saving = GRACE, SAVING_MAX
+        while self.received and not self._ended.wait(step := min(_STEP, GRACE)):
+            if _saving and left_saving > 0.0:
+                left_saving -= step
+            elif (left := left - step) <= 0.0:
+                os.kill(os.getpid(), self.received[0])

@@ -24,6 +24,7 @@ from r2p.errors import Closed, Error, InvalidName
 from r2p.log_lines import get_logger
 from r2p.messages import Message
 from r2p.modules.module import Module
+from r2p.modules.runner import saving
 from r2p.names import RESERVED, topic_name
 from r2p.recording.disk import Disk, RecordingOptions
 from r2p.recording.entries import BagEntry, MessageEntry
@@ -46,6 +47,7 @@ Part = Callable[[Module, Callable[[BagEntry], object]], AbstractAsyncContextMana
 _TURN = 10 * MILLISECOND  # ns after which what has arrived goes to the disk: small pieces, which delay little else
 _FOLLOW_EVERY = 50 * MILLISECOND  # ns between two looks for new topics
 _LOSSES_EVERY = SECOND
+_WAITING_REPORTED = 10_000_000  # bytes
 _WILDCARDS = frozenset("*?[")
 
 
@@ -229,8 +231,14 @@ class Recorder:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the subscriptions, write what has arrived, and end the file."""
-        await self._stack.aclose()
+        """End the subscriptions, write what has arrived, and end the file.
+
+        After a signal the program may take up to half a minute for that; a second one ends it at once.
+        """
+        with saving():
+            if (waiting := self._opened.queued_bytes) > _WAITING_REPORTED:
+                logger.warning("%.0f MB of the recording still wait for the disk", waiting / 1e6)
+            await self._stack.aclose()
 
     def _finish(self) -> None:
         self._alarm.close()

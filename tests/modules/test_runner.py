@@ -133,6 +133,29 @@ def test_a_program_that_does_not_end_is_ended(hang: str) -> None:
 
 
 @pytest.mark.processes
+@pytest.mark.parametrize(("takes", "may_take", "out"), [(0.5, 3600.0, "ready\nsaved\n"), (3600.0, 0.05, "ready\n")])
+def test_what_would_be_lost_is_saved_first(takes: float, may_take: float, out: str) -> None:
+    """The clean-up takes longer than it may, but for the time in which it saves something."""
+    program = f"""
+        async def saves(node: r2p.Node) -> None:
+            ready()
+            try:
+                await asyncio.Event().wait()
+            finally:
+                with runner.saving():
+                    time.sleep({takes})
+                print("saved", flush=True)
+                time.sleep(3600)
+
+        runner = sys.modules["r2p.modules.runner"]
+        runner.GRACE, runner.SAVING_MAX = 0.05, {may_take}
+        r2p.run(saves)
+    """
+    ended = execute(program, signal.SIGTERM)
+    assert (ended.code, ended.out) == (-signal.SIGTERM, out)
+
+
+@pytest.mark.processes
 def test_a_crash_is_logged_once_and_is_one_line_at_the_end_also_after_a_signal() -> None:
     program = """
         async def broken(node: r2p.Node) -> None:
