@@ -110,7 +110,7 @@ class CanFileSink(FrameSink):
         if frame.bus != f"can{channel}":
             self.losses[f"names of the bus {frame.bus}, which is channel {channel + 1} there"] += 1
         if frame.time % _MICROSECOND:
-            self.losses["times, of which microseconds are left"] += 1
+            self.losses["times finer than a microsecond"] += 1
         if frame.error and self._asc is not None:
             self.losses["contents of error frames"] += 1
         if not self._begun:

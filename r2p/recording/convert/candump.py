@@ -91,7 +91,7 @@ class CandumpSink(FrameSink):
 
     def write(self, frame: RecordedFrame) -> bool:
         if frame.time % _MICROSECOND:
-            self.losses["times, of which microseconds are left"] += 1
+            self.losses["times finer than a microsecond"] += 1
         self._file.write(text_of(frame))
         return True
 

@@ -88,18 +88,18 @@ def test_frames_come_back_from_a_file(suffix: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("suffix", "losses"),
     [
-        (".log", {"times, of which microseconds are left": 1}),
+        (".log", {"times finer than a microsecond": 1}),
         (
             ".blf",
             {
-                "times, of which microseconds are left": 1,
+                "times finer than a microsecond": 1,
                 "names of the bus lab, which is channel 1 there": 2,
             },
         ),
         (
             ".asc",
             {
-                "times, of which microseconds are left": 1,
+                "times finer than a microsecond": 1,
                 "names of the bus lab, which is channel 1 there": 2,
                 "contents of error frames": 1,
             },
