@@ -93,7 +93,7 @@ class FramePlayer:
         if not self._anyway and (heard := await self._hear()):
             raise TransportError(
                 f"{self._via} has {heard}: modules there would take recorded frames for live ones; "
-                "play onto another bus, such as vcan0, or say that you want it anyway"
+                "play onto another bus, such as vcan0, or all the same with --anyway (in programs: anyway=True)"
             )
         self._sender = await self._open()
         return self

@@ -17,7 +17,7 @@ from r2p.clock import clock_of
 from r2p.codecs.can_bits import ERROR, EXTENDED, Frame, OtherFrame, WireFrame
 from r2p.errors import TransportError
 from r2p.protocols.can_orders import Mailbox, Outcome
-from r2p.recording.entries import Entry, MessageEntry, MetadataEntry
+from r2p.recording.entries import Entry, MessageEntry
 from r2p.recording.frames import BusInfo, FrameDetails, FrameEntry, bus_name
 from r2p.sim.can import ArbitrationLoss, FrameRecord
 from r2p.sim.transport import SimCan
@@ -108,10 +108,8 @@ class FrameRecorder:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Hand on the frames that were on the bus until now, with their number, and close the interface."""
+        """Hand on the frames that were on the bus until now, and close the interface."""
         await self._source.close()
-        counts = {"frames": f"{self.frames}", **{f"lost: {reason}": f"{count}" for reason, count in self.lost.items()}}
-        self._put([MetadataEntry(self.bus.topic, counts)])
 
     def add(self, frames: list[WireFrame], utc_offset: int) -> None:
         """Hand on frames. `utc_offset`: ns from their stamps to UTC."""

@@ -7,8 +7,6 @@ A bus has a channel for each direction, as can_msgs has no field for that: frame
 that it received. `BusInfo` is in the metadata of both. An error frame is as SocketCAN has it: the classes of errors as
 its identifier, and 8 bytes about them.
 
-At the end a metadata record with the name of the channel has the numbers of frames, recorded and lost.
-
 In this package a frame is a tuple (`WireFrame`) until it is written: tens of thousands a second come in batches. Their
 bytes are made in the thread that writes.
 """
