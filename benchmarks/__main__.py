@@ -21,6 +21,7 @@ ALL = (
     "recording",
     "rtcan",
     "timers",
+    "playing",
     "start",
     "socketcan",
     "frames",

@@ -27,7 +27,8 @@ from r2p.modules.module import Module
 from r2p.modules.runner import saving
 from r2p.names import RESERVED, topic_name
 from r2p.recording.disk import Disk, RecordingOptions
-from r2p.recording.entries import BagEntry, MessageEntry
+from r2p.recording.entries import BagEntry, MessageEntry, MetadataEntry
+from r2p.recording.format import LATCHED
 from r2p.recording.messages import LOSSES, TOPICS_MAX, RecorderLosses, TopicLosses
 from r2p.recording.observations import Observations
 from r2p.recording.topics import RecordedTopic, TypeFinder
@@ -127,6 +128,7 @@ class Recorder:
         self._parts = list(parts)
         self._topics: dict[str, RecordedTopic] = {}
         self._entries: list[BagEntry] = []
+        self._latched: set[str] = set()
         self._generations: list[tuple[int, int]] = []
         self._losses_at = 0
         self._follow_at = 0
@@ -248,6 +250,7 @@ class Recorder:
         self._node.close()
         self._hand_over()
         self._put_losses()
+        self._put_latched()
         self._hand_over()
 
     # While it runs
@@ -263,6 +266,7 @@ class Recorder:
         if now >= self._losses_at:
             self._losses_at = now + _LOSSES_EVERY
             self._put_losses()
+            self._put_latched()
         self._hand_over()
         if self.stopped:
             self._ended.emit()
@@ -300,6 +304,19 @@ class Recorder:
         if self._entries:
             self._opened.put(self._entries.copy())  # a copy: the topics go on with this list
             self._entries.clear()
+
+    def _put_latched(self) -> None:
+        """Write which topics are latched, when there are more than before: who plays them latches them, too."""
+        unknown = [name for name in self._topics if name not in self._latched]
+        if found := [name for name in unknown if self._is_latched(name)]:
+            self._latched.update(found)
+            self._entries.append(MetadataEntry(LATCHED, dict.fromkeys(sorted(self._latched), "yes")))
+
+    def _is_latched(self, name: str) -> bool:
+        own = self._module.space.topics.get(name)
+        if own is not None and any(each.latch for each in own.publishers):
+            return True
+        return any(link.latched(name) for link in self._module.links)
 
     def _put_losses(self) -> None:
         counts = self.counts()

@@ -15,6 +15,7 @@ from r2p.msg import Led, Odometry, Speed3
 from r2p.recording.bag import Bag
 from r2p.recording.format import LATCHED
 from r2p.recording.player import Player, PlayOptions
+from r2p.recording.recorder import Recorder
 from r2p.recording.samples import SampleWriter
 from r2p.recording.writer import BagWriter
 from r2p.ros.clock import RosClock
@@ -172,6 +173,26 @@ async def test_latched_topics_are_for_those_who_come_later_and_for_a_late_start(
                     await asyncio.sleep(0.1)
     assert len(listener.of("leds")) == 50
     assert [each.data for each in late.of("map")] == [Led(0, 1).encode()]
+
+
+async def test_what_was_latched_when_it_was_recorded_is_latched_when_it_is_played(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    network = Network()
+    async with network.node("IMU", name="mapper") as node, network.module("PC1") as pc:
+        await node.advertise("map", Led, latch=True).publish(Led(5, 1))
+        async with Recorder(pc, path):
+            await asyncio.sleep(1)
+            await node.advertise("leds", Led).publish(Led(1, 1))
+            await asyncio.sleep(1)
+    async with listening() as (source, _):
+        with Bag(path) as bag:
+            assert bag.latched == {"map"}
+            async with Player(source, bag) as player:
+                await player.run()
+                async with node_in(source) as node:
+                    late = _Listener(node, {"map": Led, "leds": Led})
+                    await asyncio.sleep(0.1)
+    assert [(name, sample.data) for name, _, sample in late.arrived] == [("map", Led(5, 1).encode())]
 
 
 async def test_a_subscriber_without_room_gets_messages_later_and_holds_up_no_others(tmp_path: Path) -> None:
