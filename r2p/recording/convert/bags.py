@@ -12,7 +12,8 @@ from r2p.recording.bag import Bag
 from r2p.recording.bag_file import Attachment
 from r2p.recording.channels import BagChannel
 from r2p.recording.convert.ros_messages import RosDecoder, ros_decoder
-from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
+from r2p.recording.convert.stream import ConversionOptions, ConvertedItem, ConvertedRecord, Losses, RecordSink
+from r2p.recording.entries import MetadataEntry
 from r2p.recording.format import CDR, ROS2MSG
 from r2p.recording.samples import SampleWriter
 from r2p.recording.types import schema_of
@@ -24,15 +25,16 @@ _VERSIONS = {("ros1", "ros1msg"): 1, (CDR, ROS2MSG): 2}
 """The version of ROS by the encodings of a channel and its schema."""
 
 
-def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedRecord | Attachment]:
-    """Iterate over the attachments, and then over the messages. A file without an end is read as far as it goes."""
+def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedItem]:
+    """Iterate over attachments and metadata, then over messages. A file without an end is read as far as it goes."""
     return read_files([path], options, losses)
 
 
-def read_files(paths: list[Path], options: ConversionOptions, losses: Losses) -> Iterator[ConvertedRecord | Attachment]:
+def read_files(paths: list[Path], options: ConversionOptions, losses: Losses) -> Iterator[ConvertedItem]:
     """Iterate over what is in the files of one recording."""
     with Bag(paths) as bag:
         yield from bag.attachments()
+        yield from (MetadataEntry(name, values) for name, values in bag.metadata.items())
         yield from heapq.merge(_samples(bag, options), _others(bag, options, losses), key=lambda each: each.log_time)
         for topic, count in bag.undecodable.items():
             losses[f"messages of {topic} that can't be decoded"] += count
@@ -125,6 +127,9 @@ class BagSink(RecordSink):
 
     def attach(self, attachment: Attachment) -> None:
         self.writer.attach(attachment.name, attachment.media_type, attachment.data, attachment.time)
+
+    def describe(self, metadata: MetadataEntry) -> None:
+        self.writer.add_metadata(metadata.name, metadata.values)
 
     def finish(self) -> None:
         self.writer.finish()

@@ -17,7 +17,16 @@ from r2p.errors import BagError
 from r2p.recording.bag import Bag
 from r2p.recording.bag_file import Attachment
 from r2p.recording.convert.retyping import Retyping
-from r2p.recording.convert.stream import ATTACHMENTS, ConversionOptions, ConvertedRecord, Losses, RecordSink
+from r2p.recording.convert.stream import (
+    ATTACHMENTS,
+    METADATA_RECORDS,
+    ConversionOptions,
+    ConvertedItem,
+    ConvertedRecord,
+    Losses,
+    RecordSink,
+)
+from r2p.recording.entries import MetadataEntry
 
 _METADATA = "metadata.yaml"
 _PARTIAL = ".partial-"
@@ -27,7 +36,7 @@ _PARTIAL = ".partial-"
 class FormatModule(Protocol):
     """What the module of a format has."""
 
-    def read(self, path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedRecord | Attachment]:
+    def read(self, path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedItem]:
         """Iterate over the messages that the options ask for, in the order of their times. Raises BagError."""
 
     def open_sink(self, path: Path, options: ConversionOptions, losses: Losses) -> RecordSink:
@@ -113,6 +122,9 @@ def convert(
                 if isinstance(each, Attachment):
                     sink.attach(each)
                     continue
+                if isinstance(each, MetadataEntry):
+                    sink.describe(each)
+                    continue
                 for record in retype(each):
                     if sink.put(record):
                         messages[record.topic] = messages.get(record.topic, 0) + 1
@@ -123,7 +135,8 @@ def convert(
 
 def _why(source: Path, options: ConversionOptions, losses: Losses) -> str:
     """Return why no message was written."""
-    found = lost_in_words(Losses({what: count for what, count in losses.items() if what != ATTACHMENTS}))
+    extras = {ATTACHMENTS, METADATA_RECORDS}
+    found = lost_in_words(Losses({what: count for what, count in losses.items() if what not in extras}))
     if found:
         return f"{source} has {'; '.join(found)}"
     wanted = f" of {', '.join(options.topics)}" if options.topics else ""

@@ -21,7 +21,8 @@ from r2p.names import topic_name
 from r2p.recording.bag_file import Attachment
 from r2p.recording.convert import bags
 from r2p.recording.convert.ros_messages import RosDecoder, ros_decoder, ros_schema
-from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
+from r2p.recording.convert.stream import ConversionOptions, ConvertedItem, ConvertedRecord, Losses, RecordSink
+from r2p.recording.entries import MetadataEntry
 from r2p.recording.messages import SampleMeta
 from r2p.recording.types import schema_of
 from r2p.ros.library import ros2_hash
@@ -32,7 +33,7 @@ _METADATA = "metadata.yaml"
 _VERSION = 8
 
 
-def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedRecord | Attachment]:
+def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedItem]:
     """Iterate over the messages."""
     try:
         files = _plain_files(path)
@@ -122,6 +123,9 @@ class Rosbag2Sink(RecordSink):
 
     def attach(self, attachment: Attachment) -> None:
         self._bag.attach(attachment)
+
+    def describe(self, metadata: MetadataEntry) -> None:
+        self._bag.describe(metadata)
 
     def finish(self) -> None:
         self._bag.finish()

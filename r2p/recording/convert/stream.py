@@ -11,6 +11,7 @@ import msgspec
 
 from r2p.messages import Message, layout
 from r2p.recording.bag_file import Attachment
+from r2p.recording.entries import MetadataEntry
 from r2p.runtime.sample import Sample
 
 Losses: TypeAlias = Counter[str]
@@ -19,6 +20,8 @@ Losses: TypeAlias = Counter[str]
 
 ATTACHMENTS = "attachments"
 """What is lost of a recording with attachments in most formats."""
+METADATA_RECORDS = "metadata records"
+"""The same, of a recording with these: the topics that are latched."""
 
 
 class ConversionOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,6 +79,9 @@ class ConvertedRecord(msgspec.Struct, frozen=True):
         return "" if self.cls is None else layout(self.cls).name
 
 
+ConvertedItem: TypeAlias = ConvertedRecord | Attachment | MetadataEntry
+
+
 class RecordSink(abc.ABC):
     """Writes one file, or the files of one folder. Leaving it after an error leaves them unfinished."""
 
@@ -92,6 +98,10 @@ class RecordSink(abc.ABC):
     def attach(self, attachment: Attachment) -> None:
         """Write an attachment; most formats have none."""
         self.losses[ATTACHMENTS] += 1
+
+    def describe(self, metadata: MetadataEntry) -> None:
+        """Write a metadata record; most formats have none."""
+        self.losses[METADATA_RECORDS] += 1
 
     @abc.abstractmethod
     def finish(self) -> None:

@@ -20,7 +20,7 @@ from r2p.msg import Led, Odometry, Pose3, Velocity3
 from r2p.recording.bag import Bag
 from r2p.recording.convert.formats import convert, target_format
 from r2p.recording.convert.stream import ConversionOptions
-from r2p.recording.format import META_PREFIX
+from r2p.recording.format import LATCHED, META_PREFIX
 from r2p.recording.frames import BusInfo, FrameEntry, FrameWriter
 from r2p.recording.samples import SampleWriter
 from r2p.recording.writer import BagWriter
@@ -227,6 +227,18 @@ def test_messages_of_unknown_type_get_one(tmp_path: Path) -> None:
     result = convert(tmp_path / "drive.mcap", tmp_path / "typed.mcap", ConversionOptions(types={"le*": Led}))
     assert result.losses == {"messages of leds of another type than r2p_msgs/Led, kept as bytes": 1}
     assert [each[2] for each in content(tmp_path / "typed.mcap")] == [Led, None]
+
+
+def test_latched_topics_stay_latched(tmp_path: Path) -> None:
+    with (tmp_path / "drive.mcap").open("xb") as file:
+        writer = BagWriter(file)
+        writer.add_metadata(LATCHED, {"map": ""})
+        SampleWriter(writer).write("map", r2p.Sample(Led(3, 1).encode(), r2p.Source("PC"), START), Led, START)
+        writer.finish()
+    convert(tmp_path / "drive.mcap", tmp_path / "copy.mcap")
+    with Bag(tmp_path / "copy.mcap") as bag:
+        assert bag.metadata == {LATCHED: {"map": ""}}
+    assert convert(tmp_path / "drive.mcap", tmp_path / "out.csv").losses["metadata records"] == 1
 
 
 def test_a_type_that_messages_do_not_become(tmp_path: Path) -> None:
