@@ -5,6 +5,7 @@ Under virtual time there is no thread, and entries are written at once, so the s
 """
 
 import asyncio
+import contextlib
 import os
 import queue
 import threading
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import BinaryIO, Final, TypeVar
 
 from r2p.clock import Clock
+from r2p.errors import Closed
 from r2p.log_lines import get_logger
 from r2p.recording.entries import Entry
 from r2p.recording.files import RecordingFiles, RecordingOptions, open_new
@@ -124,7 +126,9 @@ class Disk:
         return fitting, size
 
     async def snapshot(self) -> Path:
-        """Write a snapshot, and return its file. Raises OSError."""
+        """Write a snapshot, and return its file. Raises OSError; Closed after `close`."""
+        if self._closed:
+            raise Closed(f"the recording {self._files.path} has ended: there is nothing more to write of it")
         return await self._call(self._files.snapshot)
 
     async def close(self) -> None:
@@ -179,7 +183,8 @@ class Disk:
             self._files.tick()
         except Exception as error:
             logger.exception("internal error in the thread that writes the recording")
-            self._files.fail(f"internal error: {error!r}")
+            with contextlib.suppress(Exception):  # whatever comes, the thread goes on, until `close`
+                self._files.fail(f"internal error: {error!r}")
 
     def _notify(self, text: str) -> None:
         if self._virtual:

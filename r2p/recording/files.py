@@ -256,8 +256,7 @@ class RecordingFiles:
         try:
             file = McapFile(raw)
         except OSError:
-            raw.close()
-            path.unlink()
+            _discard(raw, path)
             raise
         _sync_directory(path.parent)
         self.paths.append(path)
@@ -341,21 +340,27 @@ class RecordingFiles:
         if error.errno == errno.EFBIG and self._options.split and self._file is not None and self._file.has_messages:
             self._next_file()
         elif error.errno not in _FULL or not self._delete_oldest():
-            self.fail(_reason(error))
+            hint = "" if self._options.split or error.errno != errno.EFBIG else "; split goes on in another one"
+            self.fail(_reason(error) + hint)
 
     def _delete_oldest(self) -> bool:
         if not self._options.max_total or len(self.paths) < 2:
             return False
-        path = self.paths.pop(0)
+        path = self.paths[0]
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            logger.debug("can't delete %s", path, exc_info=error)
+            return False
+        self.paths.remove(path)
         self._sizes.pop(path, None)
-        with contextlib.suppress(FileNotFoundError):
-            path.unlink()
         return True
 
     def _check_total(self) -> None:
-        limit = self._options.max_total
-        while limit and self._file and sum(self._sizes.values()) + self._file.size > limit and self._delete_oldest():
-            pass
+        limit, file = self._options.max_total, self._file
+        if limit and file is not None:
+            while sum(self._sizes.values()) + file.size + file.summary_size > limit and self._delete_oldest():
+                pass
 
     def fail(self, why: str) -> None:
         """End the recording with a file that can be read, as nothing more can be written."""
@@ -409,8 +414,7 @@ class RecordingFiles:
             self._sync_file(raw)
         except OSError:
             self.paths.pop()
-            path.unlink()
-            raw.close()
+            _discard(raw, path)
             raise
         self._close(raw, file)
         return path
@@ -427,6 +431,13 @@ class RecordingFiles:
         self.writer.end_chunk()
         self._write_out()
         self._finish_file()
+
+
+def _discard(raw: BinaryIO, path: Path) -> None:
+    """Close and delete a file that could not be written."""
+    for step in (raw.close, path.unlink):
+        with contextlib.suppress(OSError):
+            step()
 
 
 def _sync_directory(path: Path) -> None:

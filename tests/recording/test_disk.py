@@ -261,7 +261,22 @@ async def test_max_total_is_kept(tmp_path: Path) -> None:
     await disk.close()
     found = sequences(*disk.paths)
     assert found == list(range(found[0], 2_001))
-    assert 100_000 < sum(path.stat().st_size for path in disk.paths) < 220_000
+    assert 150_000 < sum(path.stat().st_size for path in disk.paths) <= 200_000
+
+
+@pytest.mark.virtual_time
+async def test_where_no_old_file_can_be_deleted_a_full_disk_ends_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, *, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    disk, reports = open_disk(tmp_path / "ring.mcap", opened=Quota(150_000).open, split=True, max_total=1_000_000)
+    await record(disk, 1_000)
+    await disk.close()
+    assert reports[-1].startswith("the recording ended: the disk is full")
+    assert len(sequences(*disk.paths)) == 1_000 - disk.lost["leds"]
 
 
 @pytest.mark.virtual_time
@@ -365,6 +380,8 @@ async def test_a_snapshot_has_the_last_seconds_and_all_that_describes_them(tmp_p
     await record(disk, 100)
     second = await disk.snapshot()
     await disk.close()
+    with pytest.raises(r2p.Closed, match=r"crash\.mcap has ended"):
+        await disk.snapshot()
     assert disk.paths == [first, second] == [tmp_path / "crash-0001.mcap", tmp_path / "crash-0002.mcap"]
     found = sequences(first)
     assert found == list(range(found[0], 1_001))
