@@ -32,9 +32,8 @@ RECORDER = """
             disk.put(entries)
             print(number, clock_of().now(), flush=True)
             await asyncio.sleep(0.01)
-        lost = disk.lost
         await disk.close()
-        print("lost", number, lost["noise"], flush=True)
+        print("lost", number, disk.lost["noise"], flush=True)
 
     asyncio.run(main(sys.argv[1], int(sys.argv[2])))
 """
