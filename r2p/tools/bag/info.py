@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from r2p.recording.bag import Bag
     from r2p.recording.channels import BagChannel
 
-_RECORDER = "/r2p/recorder"
 _CHUNKS_AT_ONCE = 200  # with messages about losses, which are read without --all: some ten milliseconds
 _TOPIC_COLUMNS = ["topic", "type", "count", "rate", "publishers", "class", "link"]
 _CHANNEL_COLUMNS = ["channel", "type", "count"]
@@ -186,13 +185,15 @@ def _chunks_with(bag: "Bag", channel: str) -> int:
 
 def _add_recorder(bag: "Bag", counts: Counter[tuple[str, str]]) -> None:
     """Add what the recorder lost itself, which its last message says."""
+    from r2p.recording.messages import LOSSES, RecorderLosses
+
     last = {}
-    for each in bag.messages(_RECORDER, start=_last_chunk(bag, _RECORDER)):
+    for each in bag.messages(LOSSES, RecorderLosses, start=_last_chunk(bag, LOSSES)):
         last[each.channel.key, each.channel] = each.message
     lost: dict[object, Counter[tuple[str, str]]] = {}
     for (key, _), message in last.items():
         own: Counter[tuple[str, str]] = Counter()
-        for topic in getattr(message, "topics", ()):
+        for topic in message.topics:
             own[topic.topic, "the recorder's disk was too slow or full"] = topic.dropped
             own[topic.topic, "lost before the recorder"] = topic.missed
         lost[key] = lost.get(key, Counter()) | own  # parts of a recording count on: the largest is all of it
@@ -237,6 +238,8 @@ def _add_events(bag: "Bag", channel: str, counts: Counter[tuple[str, str]]) -> N
 
 def _add_frames(bag: "Bag", channel: str, counts: Counter[tuple[str, str]]) -> None:
     """Add CAN frames that were on the bus and are not in the file."""
-    for each in bag.messages(channel):
-        if getattr(each.message, "event", "") == "lost":
+    from r2p.recording.frames import FrameDetails
+
+    for each in bag.messages(channel, FrameDetails):
+        if each.message.event == "lost":
             counts[channel.removesuffix("/details"), each.message.text] += each.message.count
