@@ -12,9 +12,12 @@ import pytest
 
 import r2p
 from r2p.msg import Encoder, Led
+from r2p.recording.samples import SampleWriter
+from r2p.recording.writer import BagWriter
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
 
 class Lamp(r2p.Message):
@@ -129,3 +132,17 @@ async def test_what_type_checkers_see_is_what_there_is() -> None:
         module.start(mistake)
         await module.wait()
     assert last_stamp([r2p.Sample(b"", r2p.Source(), 5)]) == 5
+
+
+def test_samples_of_a_bag_are_typed(tmp_path: Path) -> None:
+    with (tmp_path / "drive.mcap").open("wb") as file:
+        writer = BagWriter(file)
+        SampleWriter(writer).write("leds", r2p.Sample(Led(3).encode(), r2p.Source("IMU"), 5), Led, 6)
+        writer.finish()
+    with r2p.Bag(tmp_path / "drive.mcap") as bag:
+        for sample in bag.samples("leds", Lamp):
+            assert_type(sample, r2p.Sample[Lamp])
+            assert sample.message == Lamp(led=3)
+        for untyped in bag.samples("leds"):
+            assert_type(untyped, r2p.Sample[Any])
+            assert untyped.message == Led(led=3)

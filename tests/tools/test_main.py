@@ -166,7 +166,7 @@ def test_help_loads_no_command_and_no_library_that_it_does_not_need() -> None:
 
 
 @pytest.mark.processes
-def test_commands_on_other_links_load_nothing_of_ros() -> None:
+def test_commands_on_other_links_load_nothing_of_ros_or_recordings() -> None:
     loaded = _loaded("topic", "echo", "leds", "--via", "tcp-listen:0", "--timeout", "10ms")
     assert "r2p.transports.tcp" in loaded
-    assert not [each for each in loaded if each.startswith("r2p.ros")]
+    assert not [each for each in loaded if each.startswith(("r2p.ros", "r2p.recording", "mcap"))]

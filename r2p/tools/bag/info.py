@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from r2p.recording.bag import Bag
     from r2p.recording.channels import BagChannel
 
+_RECORDER = "/r2p/recorder"  # whose messages say what was lost
 _CHUNKS_AT_ONCE = 200  # with messages about losses, which are read without --all: some ten milliseconds
 _TOPIC_COLUMNS = ["topic", "type", "count", "rate", "publishers", "class", "link"]
 _CHANNEL_COLUMNS = ["channel", "type", "count"]
@@ -97,6 +98,10 @@ def _head(record: dict[str, Any]) -> Iterable[str]:
         yield f"attachments  {', '.join(record['attachments'])}"
     if record["damaged_chunks"]:
         yield f"damaged      {record['damaged_chunks']} chunks, whose messages are not counted"
+    if not (record["losses"] or record["uncounted"]) and any(
+        each["channel"] == _RECORDER for each in record["channels"]
+    ):
+        yield "lost         nothing, by what the recorder knows"
     if record["uncounted"]:
         yield f"not counted  losses in {', '.join(record['uncounted'])}: --all reads these"
 

@@ -103,7 +103,7 @@ def iso(instant: int) -> str:
 
 
 def length(ns: int) -> str:
-    """Return a duration in words: 312 ms, 12.5 s, 3 min 05 s, 1 h 02 min 03 s."""
+    """Return a duration in words: 312 ms, 12.5 s, 3 min 05 s, 1 h 02 min 03 s, 3 d 4 h."""
     seconds = ns / SECOND
     if seconds < 1:
         return f"{seconds * 1000:.0f} ms"
@@ -111,6 +111,8 @@ def length(ns: int) -> str:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
+    if hours >= 48:
+        return f"{hours // 24} d {hours % 24} h"
     return f"{hours} h {minutes:02} min {rest:02} s" if hours else f"{minutes} min {rest:02} s"
 
 

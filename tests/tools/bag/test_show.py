@@ -9,7 +9,7 @@ import pytest
 import r2p
 from r2p.messages import Message
 from r2p.recording.entries import EntryWriter, MessageEntry
-from r2p.recording.messages import EVENTS, SIGNALS, RecordedEvent, RecordedSignal
+from r2p.recording.messages import EVENTS, LOSSES, SIGNALS, RecordedEvent, RecordedSignal, RecorderLosses, TopicLosses
 from r2p.recording.writer import BagWriter
 from r2p.tools import main
 from r2p.tools.bag.echo import echo
@@ -100,15 +100,18 @@ async def test_info_at_a_terminal(
 async def test_info_has_losses_by_cause(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     messages: list[tuple[str, Message]] = [(SIGNALS, each) for each in SIGNALS_OF_LEDS]
     messages += [(EVENTS, each) for each in EVENTS_OF_LINKS]
+    messages += [(LOSSES, RecorderLosses(9, 0, (TopicLosses("leds", count, 2),))) for count in (0, 4)]
     await info(observed(tmp_path / "drive.mcap", messages))
     (found,) = printed(capsys)
     assert [(each["of"], each["cause"], each["count"]) for each in found["losses"]] == [
         ("tcp", "messages lost while the link was down", 7),
         ("leds", "lost: by tcp", 5),
+        ("leds", "the recorder's disk was too slow or full", 4),
         ("leds", "missed: deadline", 3),
+        ("leds", "lost before the recorder", 2),
         ("tcp", "link down", 1),
     ]
-    assert [each["channel"] for each in found["channels"]] == [EVENTS, SIGNALS]
+    assert [each["channel"] for each in found["channels"]] == [EVENTS, LOSSES, SIGNALS]
 
 
 @pytest.mark.anyio

@@ -74,10 +74,13 @@ def test_instants_and_durations_are_shown() -> None:
     assert shown(START, date=False) == "22:13:20.250"
     assert shown((1 << 64) - 1) == "2554-07-21 23:34:33.709"
     assert iso(START + 1) == "2023-11-14T22:13:20.250000001Z"
-    assert [length(each) for each in (0, 312_000_000, 12_500_000_000, 185 * SECOND, 3723 * SECOND)] == [
+    assert [
+        length(each) for each in (0, 312_000_000, 12_500_000_000, 185 * SECOND, 3723 * SECOND, 76 * 3600 * SECOND)
+    ] == [
         "0 ms",
         "312 ms",
         "12.5 s",
         "3 min 05 s",
         "1 h 02 min 03 s",
+        "3 d 4 h",
     ]
