@@ -36,6 +36,7 @@ from r2p.recording.messages import (
 
 _PERIOD = 1.0  # s
 _SHARE = 4  # times as long as an answer took, nothing is asked
+_COUNT_MAX = (1 << 64) - 1  # sums of what modules say may be greater
 _RETRY = 5.0  # s until a module that does not answer is asked again
 
 Parameters = dict[tuple[str, str], ParameterInfo]
@@ -174,7 +175,7 @@ def growth(
                 publisher_class=int(publisher_class or 0),
                 reason=cut(reason, TEXT_MAX),
                 where=cut(where),
-                count=grown,
+                count=min(grown, _COUNT_MAX),
             )
 
 

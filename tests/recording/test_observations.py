@@ -21,6 +21,7 @@ from r2p.clock import clock_of
 from r2p.messages import Message
 from r2p.modules.statistics import ModuleStatistics, PublisherStatistics, ReasonCount
 from r2p.msg import BusTraffic, Led
+from r2p.parameters.sources import read_file
 from r2p.recording.entries import AttachmentEntry, BagEntry, MessageEntry
 from r2p.recording.messages import (
     EVENTS,
@@ -241,7 +242,9 @@ async def test_firmware_that_dies_is_noted_and_its_return() -> None:
     assert [each.kind for each in events] == ["module found", "module silent", "module found"]
 
 
-async def test_parameters_and_their_changes_and_the_network_are_in_the_file(r2p_network: Network) -> None:
+async def test_parameters_and_their_changes_and_the_network_are_in_the_file(
+    r2p_network: Network, tmp_path: Path
+) -> None:
     async def control(node: r2p.Node) -> None:
         node.parameter("kp", 0.5, unit="1/s")
         node.parameter("name", "left")
@@ -258,7 +261,9 @@ async def test_parameters_and_their_changes_and_the_network_are_in_the_file(r2p_
     assert [(each.name, each.value) for each in values] == [("kp", "0.5"), ("name", '"left"'), ("kp", "0.75")]
     assert [each.number for each in values if each.name == "kp"] == [0.5, 0.75]
     assert recorded.attachment("r2p.toml") == b"format = 1\n"
-    assert b"[params.ARM.control]\nkp = 0.5\n" in recorded.attachment("parameters.toml")
+    again = tmp_path / "parameters.toml"
+    again.write_bytes(recorded.attachment("parameters.toml"))
+    assert read_file(again, "ARM").values == {("control", "kp"): 0.5, ("control", "name"): "left"}
     network = json.loads(recorded.attachment("network.json"))
     assert {each["name"] for each in network["modules"]} == {"ROBOT", "ARM"}
     assert {"module": "ARM", "node": "control", "publishes": ["leds"], "subscribes": []} in network["nodes"]

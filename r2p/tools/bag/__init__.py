@@ -45,6 +45,7 @@ COMMANDS: dict[str, tuple[str, Register]] = {
     "echo": ("Print the messages of a recording, as r2p topic echo does.", _alone("echo", "echo")),
     "events": ("Print what happened: links, elections, slots, missed deadlines.", _alone("events", "events")),
     "slots": ("Print who owned which slot of an RTCAN bus, and when.", _alone("events", "slots")),
+    "attachment": ("List the files in a recording, or print one of them.", _alone("attachment", "attachment")),
     "frames": ("Print the CAN frames of a recording.", _alone("frames", "frames")),
     "cut": ("Write a part of a recording into a new file.", _alone("edit", "cut")),
     "merge": ("Write several recordings into one new file, in the order of time.", _alone("edit", "merge")),

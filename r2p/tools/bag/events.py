@@ -1,10 +1,10 @@
 """`r2p bag events` and `r2p bag slots`: what happened in a recording, and who owned which slot."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from r2p.tools.bag.files import File, opened
 from r2p.tools.bag.times import End, Start, moment_option, shown, span
 from r2p.tools.options import Format
 from r2p.tools.output import Output, notify
@@ -23,10 +23,6 @@ _RED = frozenset({"missed", "lost", "recorder"})
 _YELLOW = frozenset({"late", "overdue", "degraded", "log"})
 _WIDTH = max(map(len, _KINDS))
 
-Files = Annotated[
-    list[Path], typer.Argument(metavar="FILE...", help="A recording; several are read as one.", show_default=False)
-]
-
 
 def complete_kind(incomplete: str) -> list[str]:
     """Complete the kinds of --only."""
@@ -34,7 +30,7 @@ def complete_kind(incomplete: str) -> list[str]:
 
 
 async def events(
-    files: Files,
+    file: File,
     *,
     start: Start = None,
     end: End = None,
@@ -57,12 +53,11 @@ async def events(
     Also changes of parameters, warnings and losses. `r2p bag record` writes it besides the topics. At a terminal, what
     repeats within a second is one line.
     """
-    from r2p.recording.bag import Bag  # only here, as it takes a while
-    from r2p.recording.timeline import collapsed, timeline
+    from r2p.recording.timeline import collapsed, timeline  # only here, as it takes a while
 
     kinds = _chosen(only or [])
     output = Output(format)
-    with Bag(list(files)) as bag:
+    with opened(file) as bag:
         first, last = span((bag.start, bag.end), start, end)
         found = (happening for happening in timeline(bag, first, last) if not kinds or happening.kind in kinds)
         counts: dict[str, int] = {}
@@ -130,16 +125,15 @@ def _colour(happening: "Happening") -> int | None:
 
 
 async def slots(
-    files: Files,
+    file: File,
     *,
     at: Annotated[Any, moment_option("--at", "When: 12.5, -10s, 14:03:05, ISO 8601; default: at the end.")] = None,
     format: Format = None,
 ) -> None:
     """Print who owned which slot of an RTCAN bus, and when."""
-    from r2p.recording.bag import Bag
     from r2p.recording.timeline import slots_at
 
-    with Bag(list(files)) as bag:
+    with opened(file) as bag:
         time = bag.end if at is None else at.instant(bag.start, bag.end)
         if not bag.start <= time <= bag.end:
             raise UsageError(f"--at {at.text}: the recording is from {shown(bag.start)} to {shown(bag.end)}")

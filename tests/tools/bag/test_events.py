@@ -1,4 +1,4 @@
-"""`r2p bag events` and `r2p bag slots`."""
+"""`r2p bag events`, `r2p bag slots` and `r2p bag attachment`."""
 
 import asyncio
 import json
@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 import r2p
 from r2p.msg import Led
-from r2p.recording.entries import MessageEntry
+from r2p.recording.entries import AttachmentEntry, MessageEntry
 from r2p.tools.bag.record import record
 from r2p.tools.main import app
 from tests.recording.test_timeline import START, bag_of, path, utc
@@ -75,6 +75,28 @@ def test_slots_at_a_time_outside_of_the_recording(path: Path) -> None:
     result = called("slots", path, "--at", "1h")
     assert result.exit_code == 2
     assert "--at 1h: the recording is from 2023-11-14 22:13:20.000 to" in " ".join(result.stderr.split())
+
+
+def test_attachments_are_listed_printed_and_written(tmp_path: Path) -> None:
+    text, binary = "[params.ARM.reach]\nkp = 0.5\n", b"\xff\0"
+    entries = [
+        AttachmentEntry("parameters.toml", "application/toml", text.encode(), START),
+        AttachmentEntry("map.bin", "application/octet-stream", binary, START),
+    ]
+    bag = bag_of(tmp_path / "drive.mcap", [*entries])
+    assert [(each["name"], each["size"]) for each in rows(called("attachment", bag))] == [
+        ("parameters.toml", len(text)),
+        ("map.bin", 2),
+    ]
+    assert called("attachment", bag, "parameters.toml").stdout == text
+    out = tmp_path / "map.bin"
+    assert "write it to a file with -o" in " ".join(called("attachment", bag, "map.bin").stderr.split())
+    assert called("attachment", bag, "map.bin", "-o", out).exit_code == 0
+    assert out.read_bytes() == binary
+    assert "is not overwritten" in " ".join(called("attachment", bag, "map.bin", "-o", out).stderr.split())
+    other = called("attachment", bag, "r2p.toml")
+    assert other.exit_code == 2
+    assert "has no attachment r2p.toml; it has parameters.toml, map.bin" in " ".join(other.stderr.split())
 
 
 @pytest.mark.virtual_time
