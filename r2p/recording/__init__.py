@@ -7,6 +7,8 @@ A `recorder` subscribes to topics (`topics`), and hands what they receive to the
 `frame_recorder` are its other parts. `player` publishes what is in a bag, by the publishers of `played`, at the times
 that `pacing` keeps.
 
+CAN frames: `frames` says how they are written, `frame_reader` reads them, and `frame_player` plays them onto a bus.
+
 Raises BagError on import where the extra is not installed.
 """
 

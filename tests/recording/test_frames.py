@@ -15,6 +15,9 @@ from r2p.codecs.can_bits import ERROR, EXTENDED, LOCAL, REMOTE, WireFrame
 from r2p.errors import DecodeError
 from r2p.messages import Timestamp
 from r2p.msg import Header
+from r2p.protocols.rtcan.cycle import timing
+from r2p.protocols.rtcan.monitor import Monitor
+from r2p.recording.frame_reader import observe
 from r2p.recording.frames import BusInfo, CanFrame, FrameEntry, FrameWriter, RecordedFrame, bus_name, frame_of
 from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import cdr
@@ -101,6 +104,16 @@ def test_any_bytes_are_a_frame_or_refused(data: bytes) -> None:
         except DecodeError:
             continue
         assert isinstance(frame, RecordedFrame)
+
+
+@given(frames=st.lists(wire_frames(), max_size=30))
+def test_a_monitor_takes_any_frames(frames: list[WireFrame]) -> None:
+    """Also garbage where RTCAN has management and syncs, in any order of time."""
+    monitor = Monitor(timing())
+    for _, _, message in make_reader(written(BusInfo("can0"), frames)).iter_messages(log_time_order=False):
+        observe(monitor, frame_of(message.data, "can0"))
+    load = monitor.load(max((stamp for *_, stamp in frames), default=1))
+    assert sum(tally.frames for tally in load.tallies.values()) == sum(not frame[0] & ERROR for frame in frames)
 
 
 @pytest.mark.parametrize("bad", ["", "x", "-1", "0", "9" * 5000, "٣"])

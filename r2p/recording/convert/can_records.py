@@ -7,11 +7,12 @@ from r2p.errors import DecodeError
 from r2p.messages import Timestamp, layout
 from r2p.msg import Header
 from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
-from r2p.recording.frames import BusInfo, CanFrame, RecordedFrame, frame_of_message
+from r2p.recording.frames import BusInfo, CanFrame, RecordedFrame, bus_name, frame_of_message
 from r2p.runtime.sample import Sample, Source
 from r2p.units import SECOND
 
 _TYPE = layout(CanFrame).name
+_NAME_MAX = 64
 _DETAILS = "r2p_msgs/FrameDetails"
 _END = SECOND << 31  # the stamps of ROS end in 2038
 
@@ -60,7 +61,7 @@ class FrameSink(RecordSink):
         if record.type_name != _TYPE:
             return self.lose(f"messages of {record.topic}, which are not CAN frames")
         metadata = record.metadata or {}
-        name = metadata.get("bus") or record.topic.removesuffix("/frames").replace("/", "_")
+        name = bus_name(metadata.get("bus") or record.topic.removesuffix("/frames"))[:_NAME_MAX]
         try:
             frame = frame_of_message(CanFrame.decode(record.sample.data), name, sent=metadata.get("direction") == "tx")
         except DecodeError:

@@ -137,6 +137,8 @@ async def record(
     if all or topics:
         with session.waiting("a link"):  # so that there is no file of a network that can't be reached
             await wait_until(lambda: any(link.up for link in session.module.links), _LINK_UP)
+    if frames:
+        await _open_buses(session.settings)
     limits = (max_size, max_duration, split, snapshot, min_free, max_total)
     buses: list[FrameRecorder] = []
     recorder = Recorder(
@@ -253,6 +255,15 @@ def _buses(settings: Settings) -> list[str]:
     from r2p.recording.frame_recorder import CAN_SCHEMES  # only here, as it takes a while
 
     return [url for url in settings.via if url.startswith(CAN_SCHEMES)]
+
+
+async def _open_buses(settings: Settings) -> None:
+    """Open and close each CAN bus, so that there is no file of one that can't be opened. Raises TransportError."""
+    from r2p.recording.frame_recorder import FrameRecorder  # only here, as it takes a while
+
+    for url in _buses(settings):
+        async with FrameRecorder(url, lambda _entries: None):
+            pass
 
 
 def _parts(settings: Settings, buses: "list[FrameRecorder] | None", *, events: bool) -> "list[Part]":

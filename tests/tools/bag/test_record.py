@@ -11,6 +11,7 @@ import pytest
 import typer
 
 from r2p.codecs.can_bits import Frame
+from r2p.errors import TransportError
 from r2p.msg import Led
 from r2p.recording.bag import Bag
 from r2p.recording.frame_reader import BusReader
@@ -88,6 +89,16 @@ async def test_frames_alone_are_recorded_without_joining_the_bus(
     with Bag(path) as bag:
         assert [(each.id, each.data) for each in BusReader(bag).read("lab")] == [(0x123, b"abc")]
     assert printed(capsys) == [{"topic": "/lab/frames", "messages": 1, "dropped": 0, "missed": 0}]
+
+
+def test_there_is_no_file_of_a_bus_that_can_not_be_opened(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with join(Settings(via=["rtcan:nothing0"]), alone=True) as session:
+            await record(session, frames=True, output=tmp_path / "one.mcap")
+
+    with pytest.raises(TransportError, match="rtcan:nothing0: "):
+        asyncio.run(run())
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_adapter_that_can_be_opened_once_is_not_for_both() -> None:
