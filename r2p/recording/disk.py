@@ -87,6 +87,11 @@ class Disk:
         return dict(lost)
 
     @property
+    def recorded(self) -> dict[str, int]:
+        """The messages by topic in all files, once they are closed."""
+        return dict(self._files.recorded)
+
+    @property
     def queued_bytes(self) -> int:
         """Memory of what waits for the disk."""
         return self._put_bytes - self._done_bytes

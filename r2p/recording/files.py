@@ -120,6 +120,8 @@ class RecordingFiles:
         self.paths: list[Path] = []
         self.stopped = ""
         self.lost: Counter[str] = Counter()
+        self.recorded: Counter[str] = Counter()
+        """The messages by topic in finished files, those included that were deleted."""
         self.finished_bytes = 0
         self.writer = BagWriter()
         self.entries = EntryWriter(self.writer)
@@ -308,6 +310,8 @@ class RecordingFiles:
             self._syncing.join()
         with contextlib.suppress(OSError):
             raw.close()
+        for channel, count in file.counts.items():
+            self.recorded[self._name_of(channel)] += count
         self.finished_bytes += file.size
         self._sizes[self.paths[-1]] = file.size
 
@@ -375,11 +379,15 @@ class RecordingFiles:
         """Count the messages of a chunk that is in no file, and return how many they are."""
         total = 0
         for channel, part in chunk.channels.items():
-            about = self.writer.channels[channel]
-            if not about.topic.startswith(META_PREFIX):
-                self.lost[about.metadata.get("topic", about.topic)] += part.count
+            if not (name := self._name_of(channel)).startswith(META_PREFIX):
+                self.lost[name] += part.count
                 total += part.count
         return total
+
+    def _name_of(self, channel: int) -> str:
+        """Return the name under which the messages of a channel are counted: that of their topic, if they have one."""
+        about = self.writer.channels[channel]
+        return about.topic if about.topic.startswith(META_PREFIX) else about.metadata.get("topic", about.topic)
 
     def _free(self) -> int:
         found = os.statvfs(self.path.parent)

@@ -194,6 +194,11 @@ class McapFile:
         self._written.append(_Written(position, crc, line[0], line, *times))
 
     @property
+    def counts(self) -> dict[int, int]:
+        """The messages of each channel."""
+        return dict(self._counts)
+
+    @property
     def has_messages(self) -> bool:
         """Whether there is a chunk."""
         return bool(self._counts)

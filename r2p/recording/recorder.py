@@ -134,6 +134,7 @@ class Recorder:
         self._follow_at = 0
         self._ended = Pulse()
         self._disk: Disk | None = None
+        self._closed = False
         self._stack = AsyncExitStack()
 
     # What a program reads
@@ -168,12 +169,13 @@ class Recorder:
 
         Other channels, such as `/can0/frames`, are there if the disk was too slow for them.
         """
-        dropped = self._opened.lost
-        counts = {name: TopicCount(lost, lost) for name, lost in dropped.items()}
-        for name, topic in self._topics.items():
-            lost = dropped.get(name, 0) + topic.rejected
-            counts[name] = TopicCount(topic.messages + topic.rejected, lost, topic.missed)
-        return dict(sorted(counts.items()))
+        dropped, recorded = self._opened.lost, self._opened.recorded
+        counts = {}
+        for name, topic in sorted(self._topics.items()):
+            lost = dropped.get(name, 0)
+            received = recorded.get(name, 0) + lost if self._closed and not self.keeps else topic.messages
+            counts[name] = TopicCount(received + topic.rejected, lost + topic.rejected, topic.missed)
+        return counts
 
     async def wait(self) -> None:
         """Wait until the recording ends by itself: at a limit, or as the disk is full. `stopped` says why."""
@@ -241,6 +243,7 @@ class Recorder:
             if (waiting := self._opened.queued_bytes) > _WAITING_REPORTED:
                 logger.warning("%.0f MB of the recording still wait for the disk", waiting / 1e6)
             await self._stack.aclose()
+            self._closed = True
 
     def _finish(self) -> None:
         self._alarm.close()

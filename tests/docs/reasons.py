@@ -47,7 +47,8 @@ ELSEWHERE = {
 }
 """(File, key): what the key may be."""
 
-_SKIPPED = ("sim", "tools")  # what is emulated has losses of its own, tools count only for their output
+_SKIPPED = ("sim", "tools", "recording")
+"""What is emulated has losses of its own; tools count only for their output, and recordings by topic: see there."""
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

@@ -115,8 +115,11 @@ async def test_it_ends_at_a_limit_and_names_topics_without_a_publisher(
     path = tmp_path / "one.mcap"
     async with robot(leds), tool() as session:
         await record(session, ["leds", "led"], output=path, max_duration=3.0)
-    assert "led has no publisher yet; did you mean leds?" in capsys.readouterr().err
-    assert 20 <= len(values(path)) <= 30
+    output = capsys.readouterr()
+    assert "led has no publisher yet; did you mean leds?" in output.err
+    recorded = values(path)
+    assert 20 <= len(recorded) <= 30
+    assert f'"topic": "leds", "messages": {len(recorded)}, "dropped": 0' in output.out
 
 
 @pytest.mark.virtual_time
