@@ -10,7 +10,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator
-from typing import BinaryIO, Self
+from typing import Any, BinaryIO, Self
 
 import msgspec
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -52,7 +52,7 @@ _GROUPS = Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX
 
 def packed(record: McapRecord) -> bytes:
     """Return the bytes of a record."""
-    builder = RecordBuilder()
+    builder: Any = RecordBuilder()  # not all of its methods have types
     record.write(builder)
     data: bytes = builder.end()
     return data
@@ -211,7 +211,8 @@ class McapFile:
         """Write the summary and the end of the file, and leave it open."""
         end = packed(DataEnd(self._crc))
         start = self.size + len(end)
-        builder, groups = RecordBuilder(), []
+        builder: Any = RecordBuilder()
+        groups: list[SummaryOffset] = []
         for opcode, lines in self._summary():
             begin = builder.count
             for line in lines:
@@ -271,8 +272,8 @@ class McapFile:
         self._file.seek(position)
         data = self._file.read(self.size - position)
         length = RECORD.size + RECORD.unpack_from(data)[1]
-        chunk = Chunk.read(ReadDataStream(io.BytesIO(data[RECORD.size : length])))
-        return PackedChunk.make(chunk, data[length:])
+        record: Any = Chunk
+        return PackedChunk.make(record.read(ReadDataStream(io.BytesIO(data[RECORD.size : length]))), data[length:])
 
     def _put(self, data: bytes) -> None:
         rest = memoryview(data)
