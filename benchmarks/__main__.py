@@ -19,6 +19,7 @@ ALL = (
     "ros2",
     "gateway",
     "recording",
+    "recording_edit",
     "rtcan",
     "timers",
     "playing",

@@ -250,7 +250,7 @@ class Bag:
         `start` and `end` are log times (UTC, ns), `end` not included. Messages that are not decoded have what was
         recorded of them besides their bytes, such as their deadlines.
         """
-        metas: dict[tuple[int, ChannelInfo, int], SampleMeta] = {}  # of the current log time
+        metas: dict[tuple[ChannelInfo, int], SampleMeta] = {}  # of the current log time
         now = 0
         for number, (log_time, channel_id, sequence, publish_time, data) in self._messages(
             is_of(topics, {"samples", "meta"}), start, end
@@ -263,9 +263,9 @@ class Bag:
             assert info is not None
             try:
                 if channel.kind == "meta":
-                    metas[number, info, sequence] = cdr(SampleMeta).decode(data)
+                    metas[info, sequence] = cdr(SampleMeta).decode(data)
                     continue
-                meta = metas.pop((number, info, sequence), _DEFAULT) if metas else _DEFAULT
+                meta = metas.pop((info, sequence), _DEFAULT) if metas else _DEFAULT
                 from_cdr = channel.from_cdr if channel.encoding == CDR else None
                 sample = sample_of(info, sequence, publish_time, data, meta, from_cdr=from_cdr)
             except DecodeError as error:

@@ -28,7 +28,7 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 RECORD_HEAD: Final = struct.Struct("<BQ")
 """Of each record: its opcode, and the bytes behind this."""
 
-CHUNK_MAX: Final = 1 << 30
+CHUNK_MAX: Final = 1 << 28
 """Bytes of messages in one chunk, at most; of a larger one nothing is read."""
 
 TIME_MAX: Final = (1 << 64) - 1

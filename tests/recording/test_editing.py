@@ -11,6 +11,7 @@ from r2p.messages import ClockOffset
 from r2p.msg import Led
 from r2p.recording.bag import Bag
 from r2p.recording.editing import ChannelSelection, Edited, cut, merge
+from r2p.recording.writer import BagWriter
 from tests.recording.checker import check
 from tests.recording.making import MS, T0, Samples, led, leds, of, plain, read, write
 
@@ -126,3 +127,27 @@ def test_what_is_not_finished_leaves_no_file(tmp_path: Path) -> None:
         with pytest.raises(r2p.BagError, match="is there already, and is not overwritten"):
             next(cut(bag, out))
     assert out.read_text() == "mine"
+
+
+def test_a_companion_may_be_in_the_part_before_that_of_its_message(tmp_path: Path) -> None:
+    samples = leds(9)
+    with Bag(write(tmp_path / "drive.mcap", samples)) as bag:
+        records, (whole,) = list(bag.raw()), bag.files
+        behind_companion = [each.channel.kind for each in records].index("meta") + 1
+        for number, part in enumerate((records[:behind_companion], records[behind_companion:])):
+            with (tmp_path / f"part-{number}.mcap").open("wb") as file:
+                writer = BagWriter(file)
+                for record in whole.summary.channels.values():
+                    writer.copy_channel(record, whole.summary.schemas[record.schema_id])
+                ids = {channel: number for number, channel in whole.channels.items()}
+                for each in part:
+                    writer.add(ids[each.channel], each.log_time, each.publish_time, each.sequence, each.data)
+                writer.finish()
+    with Bag(tmp_path / "part.mcap") as bag:
+        assert plain(bag) == of(samples)
+
+
+def test_a_cut_without_messages_is_a_bag(tmp_path: Path) -> None:
+    out, _ = edited(write(tmp_path / "drive.mcap", leds(9)), at(20), at(30))
+    with Bag(out) as bag:
+        assert (bag.start, bag.end, bag.topics, bag.problems, plain(bag)) == (0, 0, {"leds": 0}, [], [])
