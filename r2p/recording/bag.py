@@ -74,9 +74,9 @@ def is_of(topics: Collection[str] | None, kinds: Collection[str]) -> Callable[[B
 class Bag:
     """A recording to read.
 
-    with r2p.Bag("drive.mcap") as bag:
-        for sample in bag.samples("odometry", Odometry):
-            print(sample.stamp, sample.message.x)
+        with r2p.Bag("drive.mcap") as bag:
+            for sample in bag.samples("odometry", Odometry):
+                print(sample.stamp, sample.message.x)
 
     It may have several files: the parts of one recording, which are read as one. A file that is still being written has
     what had been written when it was opened.

@@ -188,6 +188,8 @@ class _Walk:
             self._at += RECORD_HEAD.size + length
         self._end_chunk(is_last=True)
         self._end_piece()
+        if self._found.damaged and not self._found.problem:
+            self._found.problem = "has damaged chunks"
         return self._found.finish()
 
     def _record(self, opcode: int, length: int) -> None:
