@@ -1,8 +1,9 @@
 """Recordings ("bags"): MCAP files with messages, CAN frames, and what happened to them on their way.
 
 `format` says what is in a file: start there. `samples` turns samples into records and back, with the classes of `types`
-and the messages of `messages`; `writer` writes the records. `bag` reads them: of each `bag_file` what its `summary` says
-is in its `channels` and chunks, by `records`, which trusts no number in a file. `editing` makes new bags of old ones.
+and the messages of `messages`; `writer` writes the records. `bag` reads them: of each `bag_file` what its `summary`
+says is in its `channels` and chunks, by `records`, which trusts no number in a file. `editing` makes new bags of old
+ones.
 
 A `recorder` subscribes to topics (`topics`), and hands what they receive to the thread of `disk`; `observations` and
 `frame_recorder` are its other parts. `player` publishes what is in a bag, by the publishers of `played`, at the times
