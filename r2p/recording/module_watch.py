@@ -40,6 +40,7 @@ _COUNT_MAX = (1 << 64) - 1  # sums of what modules say may be greater
 _RETRY = 5.0  # s until a module that does not answer is asked again
 
 Parameters = dict[tuple[str, str], ParameterInfo]
+"""The parameters of a module, by node and name."""
 
 
 class ModuleWatch:
@@ -122,7 +123,7 @@ class ModuleWatch:
         for name, info in parameters.items():
             if before.get(name) != info:
                 self._record(PARAMETERS, parameter_value(info))
-        for name in before.keys() - parameters.keys():
+        for name in sorted(before.keys() - parameters.keys()):
             self._record(PARAMETERS, msgspec.structs.replace(parameter_value(before[name]), gone=True))
         self.parameters = parameters
 

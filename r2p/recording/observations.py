@@ -33,7 +33,7 @@ from r2p.recording.bus_watch import BusWatch
 from r2p.recording.entries import AttachmentEntry, BagEntry, MessageEntry
 from r2p.recording.log_watch import LogWatch
 from r2p.recording.messages import EVENTS, SIGNALS, TEXT_MAX, RecordedEvent, RecordedSignal, cut
-from r2p.recording.module_watch import ModuleWatch
+from r2p.recording.module_watch import ModuleWatch, Parameters
 from r2p.recording.network_files import NETWORK, PARAMETERS_FILE, network_file, parameters_file
 from r2p.runtime.events import LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
 from r2p.runtime.qos import PublisherSignal, SignalKind
@@ -68,6 +68,7 @@ class Observations:
         self._states: dict[str, str] = {}  # of modules, as they were recorded last
         self._watches: dict[str, tuple[ModuleWatch, asyncio.Task[None]]] = {}
         self._asked: set[str] = set()
+        self._former: dict[str, Parameters] = {}  # of modules that are gone
         self._described = False
 
     def _record(self, channel: str, message: Message) -> None:
@@ -182,8 +183,10 @@ class Observations:
     def _watch_modules(self, tasks: asyncio.TaskGroup) -> None:
         """Ask modules that are new, and no longer those that are gone."""
         names = {view.name for view in self._module.network.modules() if _answers(view)}
-        for name in self._watches.keys() - names:
-            self._watches.pop(name)[1].cancel()
+        for name in sorted(self._watches.keys() - names):
+            watch, task = self._watches.pop(name)
+            task.cancel()
+            self._former[name] = watch.parameters or {}
         for name in sorted(names - self._watches.keys()):
             if name not in self._asked and len(self._asked) >= _MODULES_MAX:
                 continue
@@ -204,7 +207,8 @@ class Observations:
         if self._described:
             return
         self._described = True
-        infos = [info for watch, _ in self._watches.values() for info in (watch.parameters or {}).values()]
+        known = self._former | {name: each.parameters for name, (each, _) in self._watches.items() if each.parameters}
+        infos = [info for parameters in known.values() for info in parameters.values()]
         self._attach(NETWORK, "application/json", network_file(self._module.network))
         if infos:
             self._attach(PARAMETERS_FILE, "application/toml", parameters_file(infos))

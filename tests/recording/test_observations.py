@@ -270,6 +270,23 @@ async def test_parameters_and_their_changes_and_the_network_are_in_the_file(
     assert network["versions"]["r2p"] == r2p.__version__
 
 
+async def test_parameters_of_a_module_that_dies_early_are_in_the_file(r2p_network: Network) -> None:
+    async def control(node: r2p.Node) -> None:
+        node.parameter("kp", 0.5)
+        await asyncio.get_running_loop().create_future()
+
+    async with r2p_network.module("ROBOT") as robot:
+        async with r2p_network.module("ARM") as arm:
+            arm.start(control)
+            await asyncio.sleep(1.0)
+            observing = observed(robot)
+            recorded = await observing.__aenter__()
+            await asyncio.sleep(1.5)
+        await asyncio.sleep(3.0)
+        await observing.__aexit__(None, None, None)
+    assert b"kp = 0.5" in recorded.attachment("parameters.toml")
+
+
 def counted(missed: int, uptime: float = 5.0, lost: int = 0) -> ModuleStatistics:
     link = r2p.LinkStatistics(link="tcp", lost=(ReasonCount("send buffer full", lost),))
     publisher = PublisherStatistics("steer", "control", 2, sent=100, missed=missed, late=1)
