@@ -10,7 +10,7 @@ import math
 from collections import Counter, deque
 
 from r2p.clock import Alarm
-from r2p.runtime.backpressure import GIVEN_UP, NO_ROOM, PendingDelivery, Sink
+from r2p.runtime.backpressure import GIVEN_UP, LINK_DOWN, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.node import Node
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue
 from r2p.runtime.sample import PublisherClass, Sample, Source
@@ -101,9 +101,9 @@ class PlayedPublisher:
 
     def _deliver_later(self, sample: Sample, blocked: list[Sink]) -> None:
         waiting = [sink for sink in blocked if self._may_wait(sink)]
-        lost = sum(self._loses(sink, sample) for sink in blocked if sink not in waiting)
+        lost = [sink for sink in blocked if sink not in waiting and self._loses(sink, sample)]
         if lost:
-            self.missed[NO_ROOM] += 1
+            self.missed[NO_ROOM if any(sink.reachable for sink in lost) else LINK_DOWN] += 1
         if waiting:
             self._pending.append(
                 _PlayedDelivery(self, sample, waiting, self._clock.monotonic() + self._patience(sample))
