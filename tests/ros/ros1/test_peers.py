@@ -13,7 +13,9 @@ import pytest
 from r2p.errors import NoServer, ServiceError
 from r2p.ros.middleware import Qos, RosServer
 from r2p.ros.ros1 import publishers, subscribers
+from r2p.ros.ros1.master import MasterClient
 from r2p.ros.ros1.tcpros import frame
+from r2p.ros.ros1.xmlrpc import XmlRpcClient
 from tests.ros.ros1.recorder import ANY, INT, SET_BOOL, running, talk
 
 if TYPE_CHECKING:
@@ -31,6 +33,16 @@ def anyio_backend() -> tuple[str, dict[str, Any]]:
     return "asyncio", {"use_uvloop": True}
 
 
+async def has_service(ros1: Ros1, name: str) -> None:
+    """Wait until the master knows the service."""
+    client = XmlRpcClient()
+    try:
+        while name not in (await MasterClient(client, ros1.uri).get_system_state("/test")).services:
+            pass
+    finally:
+        client.close()
+
+
 async def test_tools_of_ros_see_and_use_a_node(ros1: Ros1) -> None:
     async with running(ros1) as (middleware, user):
         middleware.advertise(talk("/tools/chat", qos=Qos(transient_local=True)))
@@ -38,6 +50,7 @@ async def test_tools_of_ros_see_and_use_a_node(ros1: Ros1) -> None:
         middleware.serve(RosServer("/blink", "/set", SET_BOOL))
         middleware.publish("/blink", "/tools/chat", frame(b"latched"), 0)
         user.serve = lambda request: b"\1" + frame(b"on" if request == b"\1" else b"off")
+        await has_service(ros1, "/set")
         async with ros1.running("rostopic", "pub", "/tools/in", "std_msgs/String", "hello"):
             echo, info, call, node = await asyncio.gather(
                 ros1.run("rostopic", "echo", "-n", "1", "/tools/chat"),

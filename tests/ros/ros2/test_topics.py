@@ -78,7 +78,7 @@ async def test_latched() -> None:
             b.subscribe(msgspec.structs.replace(latched, node="/late"))
             b.subscribe(endpoint("/late", "/other"))
             await user_b.until(lambda: user_b.arrivals)
-            assert "found /map /map_server std_msgs/String latched" in user_b.events
+            await user_b.until(lambda: "found /map /map_server std_msgs/String latched" in user_b.events)
             a.publish("/map_server", "/map", b"next", 0)
             await user_b.until(lambda: len(user_b.arrivals) == 2)
             assert [(each.data, each.sequence) for each in user_b.arrivals] == [(b"\2" * 4, 3), (b"next", 4)]
