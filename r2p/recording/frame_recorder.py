@@ -10,7 +10,7 @@ too. A simulated bus is observed from outside: with the exact bits, lost arbitra
 
 import asyncio
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Self
 
 from r2p.clock import clock_of
@@ -18,7 +18,7 @@ from r2p.codecs.can_bits import ERROR, EXTENDED, Frame, OtherFrame, WireFrame
 from r2p.errors import TransportError
 from r2p.protocols.can_orders import Mailbox, Outcome
 from r2p.recording.entries import Entry, MessageEntry
-from r2p.recording.frames import BusInfo, FrameDetails, FrameEntry, bus_name
+from r2p.recording.frames import SENDERS_MAX, TEXT_MAX, BusInfo, FrameDetails, FrameEntry, bus_name
 from r2p.sim.can import ArbitrationLoss, FrameRecord
 from r2p.sim.transport import SimCan
 from r2p.sim.transport import from_url as sim_from_url
@@ -38,7 +38,6 @@ _SHARED = ("socketcan", "socketcand", "udp_multicast", "virtual")  # interfaces 
 Put = Callable[[list[Entry]], object]
 """Gets what is to be written; it does not wait."""
 
-_SENDERS_MAX = 64
 _BATCH_S = 0.05  # seconds in which the frames of a simulated bus are collected
 _BATCH = 512  # frames after which they are handed on at once
 
@@ -125,16 +124,12 @@ class FrameRecorder:
     def add_event(self, event: str, text: str, count: int = 0) -> None:
         """Hand on something that happened now."""
         now = clock_of().now()
-        self.add_details([FrameDetails(event, start=now, end=now, count=count, text=text[:_TEXT_MAX])])
+        short = text.encode()[:TEXT_MAX].decode(errors="ignore")
+        self.add_details([FrameDetails(event, start=now, end=now, count=count, text=short)])
 
     def add_details(self, details: list[FrameDetails]) -> None:
         """Hand on details; they are written under their end."""
-        channel, metadata = self.bus.details, _DETAILS_METADATA
-        self._put([MessageEntry(channel, each, each.end, metadata=metadata) for each in details])
-
-
-_DETAILS_METADATA: Mapping[str, str] = {}
-_TEXT_MAX = 60  # characters, of at most 4 bytes each
+        self._put([MessageEntry(self.bus.details, each, each.end) for each in details])
 
 
 def _bus(name: str, link: str, options: RtcanOptions) -> BusInfo:
@@ -166,6 +161,7 @@ class _RecordedInterface:
             await asyncio.wait([waiting, self._running], return_when=asyncio.FIRST_COMPLETED)
             if self._running.done():
                 self._running.result()
+            self._running.add_done_callback(self._ended)
         except BaseException:  # also when cancelled: `__aexit__` is not called then
             await self.close()
             raise
@@ -176,6 +172,11 @@ class _RecordedInterface:
         if self._running is not None:
             self._running.cancel()
             await asyncio.wait([self._running])
+
+    def _ended(self, running: "asyncio.Task[None]") -> None:
+        """Report that the interface has failed for good."""
+        if not running.cancelled() and (error := running.exception()) is not None:
+            self.on_down(f"{error}; its frames are recorded no more")
 
     # Called by the port (`FrameTap`, `CanPortListener`)
 
@@ -245,7 +246,7 @@ class _ObservedBus:
             event, text = "error", record.error.value
             identifier, data = encode_error(text)
             self._frames.append((identifier | ERROR, data, 0, record.end))
-        senders = record.senders[:_SENDERS_MAX]
+        senders = record.senders[:SENDERS_MAX]
         self._note(FrameDetails(event, frame.id, record.start, record.end, record.bits, 0, senders, text))
 
     def _on_loss(self, loss: ArbitrationLoss) -> None:

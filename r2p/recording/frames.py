@@ -35,9 +35,9 @@ STANDARD_MASK = 0x7FF
 """The identifiers of 11 bits."""
 
 _FRAME_MEMORY = 200  # bytes of a WireFrame, about
-_SENDERS_MAX = 64
+SENDERS_MAX = 64
 _NAME_MAX = 64
-_TEXT_MAX = 256
+TEXT_MAX = 256
 _NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9_]+")
 _KINDS = tuple(bytes((kind >> 1 & 1, kind >> 2, kind & 1)) for kind in range(8))
 """The three flags of a frame, each a byte of can_msgs/Frame, by the highest three bits of its identifier."""
@@ -80,8 +80,8 @@ class FrameDetails(Message, name="r2p_msgs/FrameDetails"):
     end: i64 = 0
     bits: u32 = 0
     count: u64 = 0
-    senders: Annotated[tuple[Annotated[str, Max(_NAME_MAX)], ...], Max(_SENDERS_MAX)] = ()
-    text: Annotated[str, Max(_TEXT_MAX)] = ""
+    senders: Annotated[tuple[Annotated[str, Max(_NAME_MAX)], ...], Max(SENDERS_MAX)] = ()
+    text: Annotated[str, Max(TEXT_MAX)] = ""
 
 
 class BusInfo(msgspec.Struct, frozen=True):

@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+from collections.abc import Callable
 
 import can
 import pytest
@@ -13,6 +14,8 @@ from r2p.recording.frame_recorder import FrameRecorder
 from r2p.recording.frames import BusInfo, FrameDetails, FrameEntry
 from r2p.sim.can import CanNode
 from r2p.sim.transport import SimCan, can_bus
+from r2p.transports.can.port import CanPortListener
+from r2p.transports.can.pythoncan import PythonCanPort
 
 MS = 1_000_000
 _channels = itertools.count()
@@ -120,3 +123,22 @@ async def test_an_interface_of_python_can_is_recorded() -> None:
 async def test_a_url_without_a_can_bus_is_refused(url: str) -> None:
     with pytest.raises(TransportError, match=r"CAN bus|lacks the channel|slots=x"):
         FrameRecorder(url, Entries().put)
+
+
+@pytest.mark.anyio
+async def test_an_interface_that_fails_for_good_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The driver is gone when the adapter is plugged in again."""
+    entries, reports, plugged = Entries(), asyncio.Queue[str](), asyncio.Event()
+
+    async def run(_port: PythonCanPort, listener: CanPortListener, opened: Callable[[], object]) -> None:
+        opened()
+        listener.on_up()
+        await plugged.wait()
+        raise TransportError("rtcan:virtual:gone: no driver")
+
+    monkeypatch.setattr(PythonCanPort, "run", run)
+    async with FrameRecorder("rtcan:virtual:gone", entries.put, report=reports.put_nowait):
+        assert await reports.get() == "rtcan:virtual:gone is up"
+        plugged.set()
+        assert "no driver; its frames are recorded no more" in await reports.get()
+    assert [each.event for each in entries.details] == ["up", "down"]
