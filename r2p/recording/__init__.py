@@ -5,9 +5,10 @@ and the messages of `messages`; `writer` writes the records. `bag` reads them: o
 says is in its `channels` and chunks, by `records`, which trusts no number in a file. `editing` makes new bags of old
 ones.
 
-A `recorder` subscribes to topics (`topics`), and hands what they receive to the thread of `disk`; `observations` and
-`frame_recorder` are its other parts. `player` publishes what is in a bag, by the publishers of `played`, at the times
-that `pacing` keeps.
+A `recorder` subscribes to topics (`topics`), and hands what they receive, as `entries`, to the thread of `disk`;
+`observations` and `frame_recorder` are its other parts. `files` decides where a file ends, and what a full disk costs;
+`mcap_file` writes one, and `recovery` makes one whole that was cut off. `player` publishes what is in a bag, by the
+publishers of `played`, at the times that `pacing` keeps.
 
 CAN frames: `frames` says how they are written, `frame_reader` reads them, and `frame_player` plays them onto a bus.
 

@@ -1,6 +1,6 @@
 """What the event loop hands to the thread that writes: small structs, cheap to make.
 
-An entry knows how it is written, so that whoever records something new only needs a class of entries for it.
+An entry knows how it is written, so that something new to record needs only a class of entries.
 """
 
 import itertools

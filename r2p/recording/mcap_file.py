@@ -118,14 +118,16 @@ class PackedChunk(msgspec.Struct, frozen=True):
 
 
 def _channels(index: bytes) -> Iterator[tuple[int, ChunkMessages]]:
-    position = 0
+    position, seen = 0, set()
     while position < len(index):
         try:
             opcode, length, channel, size = _INDEX.unpack_from(index, position)
         except struct.error:
             raise DecodeError("the index of a chunk is cut short") from None
-        if opcode != Opcode.MESSAGE_INDEX or length != size + _INDEX.size - RECORD.size or size % _PAIR:
+        fits = length == size + _INDEX.size - RECORD.size and size % _PAIR == 0
+        if opcode != Opcode.MESSAGE_INDEX or not fits or channel in seen:
             raise DecodeError("the index of a chunk is damaged")
+        seen.add(channel)
         yield channel, ChunkMessages(size // _PAIR, position)
         position += _INDEX.size + size
     if position > len(index):

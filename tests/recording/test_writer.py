@@ -91,7 +91,12 @@ def test_chunks_are_copied_between_messages_as_they_are(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("index", "text"),
-    [(b"\7", "cut short"), (b"\7" + bytes(14), "damaged"), (chunks(bag())[0][1][:-1], "cut short")],
+    [
+        (b"\7", "cut short"),
+        (b"\7" + bytes(14), "damaged"),
+        (2 * chunks(bag())[0][1], "damaged"),
+        (chunks(bag())[0][1][:-1], "cut short"),
+    ],
 )
 def test_a_damaged_index_is_not_copied(index: bytes, text: str) -> None:
     writer = BagWriter(io.BytesIO())
