@@ -16,7 +16,6 @@ from typing import Any, Self
 from r2p.clock import clock_of
 from r2p.codecs.can_bits import ERROR, EXTENDED, Frame, OtherFrame, WireFrame
 from r2p.errors import TransportError
-from r2p.modules.module import Module
 from r2p.protocols.can_orders import Mailbox, Outcome
 from r2p.recording.entries import Entry, MessageEntry
 from r2p.recording.frames import SENDERS_MAX, TEXT_MAX, BusInfo, FrameDetails, FrameEntry, bus_name
@@ -136,19 +135,6 @@ class FrameRecorder:
 def _bus(name: str, link: str, options: RtcanOptions) -> BusInfo:
     timing = options.timing
     return BusInfo(name, link, options.bitrate, timing.slots, round(options.cycle * SECOND))
-
-
-def frames_of(via: str | SimCan, *, name: str = "") -> Callable[[Module, Callable[[Entry], object]], FrameRecorder]:
-    """Return the part of a `Recorder` that records the frames of a bus, as `FrameRecorder` does.
-
-    async with r2p.Recorder(module, "drive.mcap", parts=[Observations, frames_of("rtcan:can0")]):
-        await module.wait()
-    """
-
-    def begin(_module: Module, add: Callable[[Entry], object]) -> FrameRecorder:
-        return FrameRecorder(via, lambda entries: [add(each) for each in entries], name=name)
-
-    return begin
 
 
 class _RecordedInterface:
