@@ -16,6 +16,9 @@ from r2p.ros.cdr import cdr
 from r2p.ros.transcoding import transcoder
 from r2p.runtime.sample import PublisherClass, Sample, Source
 
+_encode = cdr(SampleMeta).encode
+_UNSTAMPED = _encode(SampleMeta(stamped=False))  # made once: each message on a debug line has it
+
 _TIME_MASK = (1 << 64) - 1  # times in a file are not negative, those of a module may be
 
 
@@ -44,9 +47,9 @@ class SampleWriter:
                 channel, data, rest = self._untyped(key), sample.data, b""
         publish_time = sample.stamp & _TIME_MASK if sample.stamped else log_time
         sequence = number & SEQUENCE_MASK if number else next(channel.count) & SEQUENCE_MASK
-        plain = sample.stamped and sample.drop_late and sample.clock is None and not (due or sample.hops or rest)
-        if not plain or number > SEQUENCE_MASK:
-            meta = cdr(SampleMeta).encode(_meta(sample, rest))
+        plain = sample.drop_late and sample.clock is None and not (due or sample.hops or rest or number > SEQUENCE_MASK)
+        if not (plain and sample.stamped):
+            meta = _UNSTAMPED if plain else _encode(_meta(sample, rest))
             self._writer.add(self._companion(channel), log_time, publish_time, sequence, meta)
         self._writer.add(channel.id, log_time, publish_time, sequence, data)
 
