@@ -205,10 +205,12 @@ _OF_RECORDINGS = {
 """What is imported when it is used first: most programs record nothing, and need no extra for it."""
 
 
-def __getattr__(name: str) -> object:
-    """Return what a program uses of recordings. Raises BagError if the extra is not installed."""
-    if name not in _OF_RECORDINGS:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found: object = getattr(importlib.import_module(_OF_RECORDINGS[name]), name)
-    globals()[name] = found
-    return found
+if not TYPE_CHECKING:  # with it, type checkers would accept any name
+
+    def __getattr__(name: str) -> object:
+        """Return what a program uses of recordings. Raises BagError if the extra is not installed."""
+        if name not in _OF_RECORDINGS:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        found: object = getattr(importlib.import_module(_OF_RECORDINGS[name]), name)
+        globals()[name] = found
+        return found
