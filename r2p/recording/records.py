@@ -77,6 +77,8 @@ class RecordFile:
         """Open the file. Raises BagError, also for a file that is not MCAP."""
         self.path = path
         try:
+            if not path.is_dir() and path.exists() and not path.is_file():  # a pipe would be waited for
+                raise BagError(f"{path} is a pipe or a device: a recording is read at several places, so copy it first")
             self._file: BinaryIO = path.open("rb")
             self.size = self._file.seek(0, 2)
         except OSError as error:

@@ -26,13 +26,14 @@ _LINE = re.compile(
 )
 _FD = re.compile(r"\(\d+\.\d+\)\s+\S+\s+[0-9A-F]+##", re.ASCII | re.IGNORECASE)
 _STANDARD_DIGITS = 3
+_LINE_MAX = 4096  # characters; what is longer is read as several lines that are not frames
 
 
 def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedRecord]:
     """Iterate over the frames; a line that is not a frame is counted."""
     records = FrameRecords(options, losses)
     with path.open(encoding="ascii", errors="replace") as file:
-        for line in file:
+        for line in iter(lambda: file.readline(_LINE_MAX), ""):
             frame = parse(line)
             if isinstance(frame, str):
                 if frame:

@@ -19,6 +19,7 @@ from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Los
 from r2p.recording.convert.tables import CONTEXT, DATA, TablePaths, by_time, context_of, record_of, tables
 
 _SUFFIX = ".csv"
+_LINE_MAX = 3 * SIZE_MAX  # characters
 _CELL_MAX = 2 * SIZE_MAX  # characters of the longest cell, which is a message in hex
 
 
@@ -32,7 +33,7 @@ def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[Con
 def _read_table(topic: str, path: Path, options: ConversionOptions) -> Iterator[ConvertedRecord]:
     cls = options.type_of(topic)
     with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark in front
-        rows = csv.DictReader(file, strict=True)
+        rows = csv.DictReader(_lines(file), strict=True)
         try:
             pack = _packer(topic, path, rows.fieldnames or (), cls)
             for row in rows:
@@ -41,6 +42,13 @@ def _read_table(topic: str, path: Path, options: ConversionOptions) -> Iterator[
                     yield record
         except (csv.Error, ValueError, RecursionError, MessageError) as error:
             raise BagError(f"{path}, line {rows.line_num}: {error}") from None
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    while line := file.readline(_LINE_MAX):
+        if len(line) == _LINE_MAX:
+            raise ValueError("the line is too long to be one of a table")
+        yield line
 
 
 def _packer(topic: str, path: Path, columns: Any, cls: type[Message] | None) -> Callable[[Mapping[str, Any]], bytes]:
@@ -81,15 +89,15 @@ class CsvSink(RecordSink):
     def __init__(self, path: Path, options: ConversionOptions, losses: Losses) -> None:
         super().__init__(losses)
         self._paths = TablePaths(path, _SUFFIX, options)
-        self._tables: dict[str, _WrittenTable | None] = {}
+        self._tables: dict[str, _WrittenTable | str] = {}
 
     def put(self, record: ConvertedRecord) -> bool:
         if record.topic not in self._tables:
             path = self._paths.find(record)
-            self._tables[record.topic] = None if path is None else _WrittenTable(path, record.cls)
+            self._tables[record.topic] = path if isinstance(path, str) else _WrittenTable(path, record.cls)
         table = self._tables[record.topic]
-        if table is None:
-            return self.lose(f"messages of {record.topic}, which --topics {record.topic} converts")
+        if isinstance(table, str):
+            return self.lose(table)
         problem = table.write(record)
         return self.lose(problem) if problem else True
 
@@ -98,7 +106,7 @@ class CsvSink(RecordSink):
 
     def close(self) -> None:
         for each in self._tables.values():
-            if each is not None:
+            if isinstance(each, _WrittenTable):
                 each.file.close()
 
 

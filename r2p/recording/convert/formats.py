@@ -218,6 +218,8 @@ def _check_target(source: Path, target: Path, format: Format, *, overwrite: bool
         return
     if target.resolve() == source.resolve():
         raise BagError(f"{target} is what is to be converted: choose another name for the result")
+    if target.resolve() in source.resolve().parents:
+        raise BagError(f"{target} has {source.name}, which is to be converted: choose another name for the result")
     if target.is_dir() and not any(target.iterdir()):
         return
     if not overwrite:
@@ -228,6 +230,8 @@ def _check_target(source: Path, target: Path, format: Format, *, overwrite: bool
         )
         if foreign is not None:
             raise BagError(f"{target} is not replaced: it also has {foreign.name}, which is not {format.name}")
+        if format.name == "rosbag2" and not (target / _METADATA).exists():  # a folder of recordings
+            raise BagError(f"{target} is not replaced: it has no {_METADATA}, so it is not a recording of ROS 2")
 
 
 def _may_replace(file: Path, format: Format) -> bool:

@@ -35,6 +35,7 @@ _ROWS = 8192  # of a group, which are held in memory
 _READ_ROWS = 1024
 _TYPE, _SCHEMA, _DEFINITION = b"r2p.type", b"r2p.schema", b"r2p.definition"
 _TIME = pa.timestamp("ns", tz="UTC")
+_LATEST = (1 << 63) - 1  # ns since 1970 that it can hold
 _CONTEXT = [(name, _TIME if name in TIMES else pa.uint64() if name == SEQUENCE else pa.string()) for name in CONTEXT]
 _SCALARS = {
     "bool": pa.bool_(),
@@ -101,26 +102,26 @@ class ParquetSink(RecordSink):
     def __init__(self, path: Path, options: ConversionOptions, losses: Losses) -> None:
         super().__init__(losses)
         self._paths = TablePaths(path, _SUFFIX, options)
-        self._tables: dict[str, _ArrowTable | None] = {}
+        self._tables: dict[str, _ArrowTable | str] = {}
 
     def put(self, record: ConvertedRecord) -> bool:
         if record.topic not in self._tables:
             path = self._paths.find(record)
-            self._tables[record.topic] = None if path is None else _ArrowTable(path, record.cls)
+            self._tables[record.topic] = path if isinstance(path, str) else _ArrowTable(path, record.cls)
         table = self._tables[record.topic]
-        if table is None:
-            return self.lose(f"messages of {record.topic}, which --topics {record.topic} converts")
+        if isinstance(table, str):
+            return self.lose(table)
         problem = table.write(record)
         return self.lose(problem) if problem else True
 
     def finish(self) -> None:
         for each in self._tables.values():
-            if each is not None:
+            if isinstance(each, _ArrowTable):
                 each.flush()
 
     def close(self) -> None:
         for each in self._tables.values():
-            if each is not None:
+            if isinstance(each, _ArrowTable):
                 each.writer.close()
 
 
@@ -140,7 +141,9 @@ class _ArrowTable:
         """Add a row; return in words what is lost if it has no place here, and else nothing."""
         if record.cls is not self._cls:
             return f"messages of {record.topic} of another type than the first"
-        data = record.sample.data
+        data, context = record.sample.data, context_of(record)
+        if any(each is not None and each > _LATEST for each in context[: len(TIMES)]):
+            return f"messages of {record.topic} from after the year 2262"
         try:
             message = None if self._cls is None else self._cls.decode(data)
         except DecodeError:
@@ -148,7 +151,7 @@ class _ArrowTable:
         values = (
             [data] if message is None else [_value(each.shape, getattr(message, each.name)) for each in self._fields]
         )
-        for column, value in zip(self._columns, [*context_of(record), *values], strict=True):
+        for column, value in zip(self._columns, [*context, *values], strict=True):
             column.append(value)
         if len(self._columns[0]) >= _ROWS:
             self.flush()

@@ -23,6 +23,8 @@ CONTEXT = (*TIMES, SEQUENCE, MODULE, NODE, LINK, CLASS)
 DATA = "data"
 """The column of messages of unknown type."""
 
+_FILE_NAME_MAX = 200  # bytes of a file's name without its suffix
+
 
 def context_of(record: ConvertedRecord) -> list[Any]:
     """Return the values of CONTEXT; None for those that a message does not have."""
@@ -96,19 +98,22 @@ class TablePaths:
         self._topic: str | None = None
         """That of the one file."""
 
-    def find(self, record: ConvertedRecord) -> Path | None:
-        """Return the file for messages of a topic, in a folder that exists; None for a topic that is left out.
+    def find(self, record: ConvertedRecord) -> Path | str:
+        """Return the file for messages of a topic, in a folder that exists; in words what is lost of one without.
 
         One file has a topic of the network, and what the recorder writes besides only if the user asks for that.
         Raises BagError for a second topic.
         """
         topic = record.topic
         if not self._is_file:
-            file = self._path.joinpath(*topic.split("/"))
+            parts = topic.split("/")
+            if not all(map(_is_file_name, parts)):  # such as `..`, in a recording of another program
+                return f"messages of {topic}, which can't be the name of a file"
+            file = self._path.joinpath(*parts)
             file.parent.mkdir(parents=True, exist_ok=True)
             return file.with_name(f"{file.name}{self._suffix}")
         if f"/{topic}".startswith(OWN_PREFIX) and not self._options.names(topic):
-            return None
+            return f"messages of {topic}, which --topics {topic} converts"
         if self._topic not in (None, topic):
             raise BagError(
                 f"{self._path.name} is one table, but there are messages of {self._topic} and of {topic}: choose one "
@@ -116,3 +121,12 @@ class TablePaths:
             )
         self._topic = topic
         return self._path
+
+
+def _is_file_name(part: str) -> bool:
+    return (
+        part not in ("", ".", "..")
+        and part.isprintable()
+        and "\\" not in part
+        and len(part.encode(errors="replace")) <= _FILE_NAME_MAX
+    )
