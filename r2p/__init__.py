@@ -92,8 +92,8 @@ from r2p.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from r2p.recording.bag import Bag
-    from r2p.recording.disk import RecordingOptions
     from r2p.recording.recorder import Recorder
+    from r2p.recording.recording_files import RecordingOptions
 
 __all__ = [
     "Array",
@@ -200,7 +200,7 @@ __all__ = [
 _OF_RECORDINGS = {
     "Bag": "r2p.recording.bag",
     "Recorder": "r2p.recording.recorder",
-    "RecordingOptions": "r2p.recording.disk",
+    "RecordingOptions": "r2p.recording.recording_files",
 }
 """What is imported when it is used first: most programs record nothing, and need no extra for it."""
 

@@ -17,8 +17,8 @@ from r2p.messages import Message
 from r2p.recording.bag_file import Attachment, BagFile, Paths, bag_paths
 from r2p.recording.channels import BagChannel, M
 from r2p.recording.format import CDR, LATCHED, METADATA, ChannelInfo
+from r2p.recording.mcap_reader import TIME_MAX, ChunkRef, RawMessage
 from r2p.recording.messages import SampleMeta
-from r2p.recording.records import TIME_MAX, ChunkRef, RawMessage
 from r2p.recording.samples import sample_of
 from r2p.ros.cdr import cdr
 from r2p.runtime.sample import Sample

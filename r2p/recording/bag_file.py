@@ -14,7 +14,7 @@ from mcap.records import Metadata as MetadataRecord
 from r2p.errors import BagError
 from r2p.recording.channels import BagChannel, channels_of
 from r2p.recording.format import FORMAT, METADATA
-from r2p.recording.records import RECORD_HEAD, TIME_MAX, ChunkRef, RawMessage, RecordFile, messages, parse
+from r2p.recording.mcap_reader import RECORD_HEAD, TIME_MAX, ChunkRef, McapReader, RawMessage, messages, parse
 from r2p.recording.summary import Summary, read_summary
 
 SUFFIX = ".mcap"
@@ -38,7 +38,7 @@ class BagFile:
 
     def __init__(self, path: Path) -> None:
         """Open the file. Raises BagError."""
-        self.file = RecordFile(path)
+        self.file = McapReader(path)
         try:
             self.summary: Summary = read_summary(self.file)
             self.is_own = any(index.name == METADATA for index in self.summary.metadata)

@@ -23,8 +23,8 @@ from r2p.recording.bag import Bag, RawRecord
 from r2p.recording.bag_file import BagFile
 from r2p.recording.channels import BagChannel
 from r2p.recording.format import LATCHED, METADATA, OWN_PREFIX
+from r2p.recording.mcap_reader import TIME_MAX, ChunkRef, parse
 from r2p.recording.messages import SampleMeta
-from r2p.recording.records import TIME_MAX, ChunkRef, parse
 from r2p.recording.writer import ABOUT, BagWriter
 from r2p.ros.cdr import cdr
 

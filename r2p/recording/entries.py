@@ -49,9 +49,6 @@ class BagEntry(msgspec.Struct, gc=False):
         """Write the entry, in the thread."""
 
 
-Entry = BagEntry
-
-
 class SampleEntry(BagEntry, gc=False):
     """A sample of a topic, of the given class if it is known, received at `log_time` (ns, UTC)."""
 

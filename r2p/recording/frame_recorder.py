@@ -17,7 +17,7 @@ from r2p.clock import clock_of
 from r2p.codecs.can_bits import ERROR, EXTENDED, Frame, OtherFrame, WireFrame
 from r2p.errors import TransportError
 from r2p.protocols.can_orders import Mailbox, Outcome
-from r2p.recording.entries import Entry, MessageEntry
+from r2p.recording.entries import BagEntry, MessageEntry
 from r2p.recording.frames import SENDERS_MAX, TEXT_MAX, BusInfo, FrameDetails, FrameEntry, bus_name
 from r2p.sim.can import ArbitrationLoss, FrameRecord
 from r2p.sim.transport import SimCan
@@ -35,7 +35,7 @@ CAN_SCHEMES = ("rtcan:", "sim:")
 
 _SHARED = ("socketcan", "socketcand", "udp_multicast", "virtual")  # interfaces that several programs can open
 
-Put = Callable[[list[Entry]], object]
+Put = Callable[[list[BagEntry]], object]
 """Gets what is to be written; it does not wait."""
 
 _BATCH_S = 0.05  # seconds in which the frames of a simulated bus are collected
@@ -53,13 +53,13 @@ def is_shareable(via: str) -> bool:
 
 def frames_of(
     via: str | SimCan, *, name: str = "", report: Callable[[str], object] | None = None
-) -> "Callable[[object, Callable[[Entry], object]], FrameRecorder]":
+) -> "Callable[[object, Callable[[BagEntry], object]], FrameRecorder]":
     """Return a part of a `Recorder` that records the frames of a bus beside the topics; arguments as those below.
 
     Recorder(module, "drive.mcap", parts=[Observations, frames_of("rtcan:can0")])
     """
 
-    def begin(_module: object, add: Callable[[Entry], object]) -> FrameRecorder:
+    def begin(_module: object, add: Callable[[BagEntry], object]) -> FrameRecorder:
         return FrameRecorder(via, lambda entries: [add(each) for each in entries], name=name, report=report)
 
     return begin

@@ -15,29 +15,33 @@ reasons from their log. Firmware counts nothing, and ROS nodes are not asked.
 """
 
 import asyncio
+import json
+import platform
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import msgspec
+import tomli_w
 
 from r2p.codecs.own_services import WIRE_MIN
 from r2p.errors import Closed
 from r2p.log_lines import get_logger
 from r2p.messages import Message
-from r2p.modules.graph import ModuleView
+from r2p.modules.graph import ModuleView, NetworkView
 from r2p.modules.module import Module
+from r2p.parameters.definition import ParameterInfo
 from r2p.protocols.discovery.events import Mismatched, ModuleChanged, ModuleGone, NameConflict
 from r2p.recording.bus_watch import BusWatch
 from r2p.recording.entries import AttachmentEntry, BagEntry, MessageEntry
 from r2p.recording.log_watch import LogWatch
 from r2p.recording.messages import EVENTS, SIGNALS, TEXT_MAX, RecordedEvent, RecordedSignal, cut
 from r2p.recording.module_watch import ModuleWatch, Parameters
-from r2p.recording.network_files import NETWORK, PARAMETERS_FILE, network_file, parameters_file
 from r2p.runtime.events import LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
 from r2p.runtime.qos import PublisherSignal, SignalKind
 from r2p.units import SECOND
+from r2p.version import __version__
 
 SIGNALS_MAX = 1000
 """Signals in a second that are recorded one by one; further ones are added up, by publisher and reason."""
@@ -47,6 +51,9 @@ _FIRMWARE_SILENT = 15.0  # s; it says ALIVE once in all its announcements, one o
 _MODULES_MAX = 256  # modules that are asked: names come from the network, and channels of a file stay
 
 logger = get_logger("r2p.recording")
+
+NETWORK, PARAMETERS_FILE = "network.json", "parameters.toml"
+"""The names of the attachments that describe the network."""
 
 Attachments = Mapping[str, tuple[str, bytes]]
 """Files by name: their media type, and their contents."""
@@ -245,6 +252,40 @@ def event_message(event: ModuleEvent) -> RecordedEvent:
             return RecordedEvent(kind="module silent" if silent else "module gone", module=cut(info.name))
         case ModuleChanged(info):
             return RecordedEvent(kind="module changed", module=cut(info.name))
+
+
+def network_file(network: NetworkView) -> bytes:
+    """Return the modules, nodes and topics of a network, and the versions of what records it."""
+    modules = [msgspec.to_builtins(view) for view in network.modules()]
+    nodes = [
+        {"module": module, "node": node, "publishes": published, "subscribes": subscribed}
+        for (module, node), (published, subscribed) in network.nodes().items()
+    ]
+    topics = [
+        {"topic": view.name, "type": view.layout.name if view.layout else view.ros_type, "size": view.size}
+        for view in network.topics().values()
+    ]
+    versions = {"r2p": __version__, "python": platform.python_version(), "system": platform.system()}
+    content = {"versions": versions, "modules": modules, "nodes": nodes, "topics": topics}
+    return json.dumps(content, indent=2).encode()
+
+
+def parameters_file(infos: Iterable[ParameterInfo]) -> bytes:
+    """Return parameters as a file that `r2p run --params` and `r2p param load` read.
+
+    Modules have the names that they have themselves, without the prefix of a gateway, unless two would be the same.
+    """
+    infos = list(infos)
+    modules = {info.module for info in infos}
+    short = {name: name.rpartition("/")[2] for name in modules}
+    taken = list(short.values())
+    tables: dict[str, Any] = {}
+    for info in infos:
+        own = short[info.module]
+        name = own if taken.count(own) == 1 else info.module
+        value = list(info.value) if isinstance(info.value, tuple) else info.value
+        tables.setdefault(name, {}).setdefault(info.node, {})[info.name] = value
+    return tomli_w.dumps({"format": 1, "params": tables}).encode()
 
 
 class _SignalRecorder:

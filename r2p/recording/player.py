@@ -21,7 +21,7 @@ from r2p.recording.bag import Bag, RecordedSample
 from r2p.recording.channels import BagChannel
 from r2p.recording.format import ChannelInfo
 from r2p.recording.pacing import PacedStream, Pacer
-from r2p.recording.played import PlayedPeriodic, PlayedPublisher, period_of
+from r2p.recording.played_publisher import PlayedPeriodic, PlayedPublisher, period_of
 from r2p.ros.clock import PERIOD, TOPIC, RosClock
 from r2p.runtime.node import Node
 from r2p.runtime.sample import PublisherClass, Sample

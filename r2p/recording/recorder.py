@@ -1,7 +1,7 @@
 """Records the topics of a module's network, and what happens there, into a bag.
 
     a message arrives -> RecordedTopic appends it to a list, in the event loop
-    _TURN later       -> the list goes to the Disk, whose thread writes it
+    _TURN later       -> the list goes to the BackgroundWriter, whose thread writes it
 
 Nothing waits for the recorder: neither a publisher, nor a link, nor the event loop. What is recorded besides topics are
 parts of the recorder: each is an asynchronous context manager, made with the module and with a function that takes what
@@ -26,11 +26,12 @@ from r2p.messages import Message
 from r2p.modules.module import Module
 from r2p.modules.runner import saving
 from r2p.names import RESERVED, topic_name
-from r2p.recording.disk import Disk, RecordingOptions
+from r2p.recording.background_writer import BackgroundWriter
 from r2p.recording.entries import BagEntry, MessageEntry, MetadataEntry
 from r2p.recording.format import LATCHED
 from r2p.recording.messages import LOSSES, TOPICS_MAX, RecorderLosses, TopicLosses
 from r2p.recording.observations import Observations
+from r2p.recording.recording_files import RecordingOptions
 from r2p.recording.topics import RecordedTopic, TypeFinder
 from r2p.runtime.node import Node
 from r2p.runtime.queues import Pulse
@@ -133,7 +134,7 @@ class Recorder:
         self._losses_at = 0
         self._follow_at = 0
         self._ended = Pulse()
-        self._disk: Disk | None = None
+        self._writer: BackgroundWriter | None = None
         self._closed = False
         self._stack = AsyncExitStack()
 
@@ -142,7 +143,7 @@ class Recorder:
     @property
     def started(self) -> bool:
         """Whether the recording has begun; True also after its end."""
-        return self._disk is not None
+        return self._writer is not None
 
     @property
     def keeps(self) -> bool:
@@ -162,7 +163,7 @@ class Recorder:
     @property
     def stopped(self) -> str:
         """The reason why the recording has ended by itself, such as a full disk; empty while it goes on."""
-        return "" if self._disk is None else self._disk.stopped
+        return "" if self._writer is None else self._writer.stopped
 
     def counts(self) -> dict[str, TopicCount]:
         """Return what was received and lost so far, by topic. Raises Closed before the recorder was started.
@@ -193,10 +194,10 @@ class Recorder:
         return await self._opened.snapshot()
 
     @property
-    def _opened(self) -> Disk:
-        if self._disk is None:
+    def _opened(self) -> BackgroundWriter:
+        if self._writer is None:
             raise Closed(f"the recorder of {self.path} was not started: use it in an `async with` block")
-        return self._disk
+        return self._writer
 
     # The beginning and the end
 
@@ -204,11 +205,11 @@ class Recorder:
         """Begin to record. Raises FileExistsError if the file exists, OSError if it can't be made, and Closed if the
         module is not open.
         """
-        if self._disk is not None:
+        if self._writer is not None:
             raise Error(f"the recorder of {self.path} was started before: make a new one")
         space = self._module.space
-        self._disk = Disk(self.path, self._options, space.clock, logger.warning)
-        self._stack.push_async_callback(self._disk.close)
+        self._writer = BackgroundWriter(self.path, self._options, space.clock, logger.warning)
+        self._stack.push_async_callback(self._writer.close)
         try:
             await self._begin()
         except BaseException:

@@ -19,12 +19,12 @@ from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema
 
 from r2p.errors import BagError, DecodeError
 from r2p.recording.format import META_PREFIX
-from r2p.recording.records import (
+from r2p.recording.mcap_reader import (
     CHUNK_MAX,
     MAGIC,
     RECORD_HEAD,
+    McapReader,
     RawMessage,
-    RecordFile,
     messages,
     other_records,
     parse,
@@ -85,7 +85,7 @@ def recover_in_steps(
 ) -> Generator[RecoveryReport, None, None]:
     """Do the same in steps, and yield the report of each; if it is closed before its end, there is no new file."""
     path, complete = Path(target), False
-    with contextlib.closing(RecordFile(Path(source))) as file, path.open("xb") as new:
+    with contextlib.closing(McapReader(Path(source))) as file, path.open("xb") as new:
         try:
             recovery = RecordingRecovery(file, new)
             yield from recovery.run()
@@ -100,7 +100,7 @@ def recover_in_steps(
 class RecordingRecovery:
     """Reads one file to its end, or to the cut, and writes what is whole."""
 
-    def __init__(self, source: RecordFile, target: BinaryIO) -> None:
+    def __init__(self, source: McapReader, target: BinaryIO) -> None:
         """Begin the new file. Raises OSError, as `run` does."""
         self._source = source
         self.report = RecoveryReport()

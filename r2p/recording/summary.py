@@ -14,12 +14,12 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Footer, Header, MetadataIndex, Schema, Statistics
 
 from r2p.errors import BagError
-from r2p.recording.records import (
+from r2p.recording.mcap_reader import (
     MAGIC,
     RECORD_HEAD,
     TIME_MAX,
     ChunkRef,
-    RecordFile,
+    McapReader,
     messages,
     other_records,
     parse,
@@ -74,7 +74,7 @@ class Summary(msgspec.Struct, eq=False):
         return self
 
 
-def read_summary(file: RecordFile) -> Summary:
+def read_summary(file: McapReader) -> Summary:
     """Return what is in a file, whatever its state is. Raises BagError if it can't be read at all."""
     footer = _footer(file)
     if footer is None:
@@ -88,7 +88,7 @@ def read_summary(file: RecordFile) -> Summary:
     return found or _Walk(file).summary()
 
 
-def _footer(file: RecordFile) -> Footer | None:
+def _footer(file: McapReader) -> Footer | None:
     """Return the footer of a file; None if it does not end with one."""
     at = file.size - _FOOTER
     if at < len(MAGIC) or file.read(file.size - len(MAGIC), len(MAGIC)) != MAGIC:
@@ -99,7 +99,7 @@ def _footer(file: RecordFile) -> Footer | None:
         return None
 
 
-def _from_section(file: RecordFile, footer: Footer) -> Summary | None:
+def _from_section(file: McapReader, footer: Footer) -> Summary | None:
     """Return what the summary section says; None if that is less than a walk finds."""
     length = file.size - len(MAGIC) - footer.summary_start
     if length > _SECTION_MAX:
@@ -155,7 +155,7 @@ def _chunk_index(section: bytes, at: int, size: int) -> ChunkRef:
     return ChunkRef(start, end, offset, length, index_length, compression.decode(), unpacked, channels)
 
 
-def _library(file: RecordFile) -> str:
+def _library(file: McapReader) -> str:
     try:
         return parse(Header, file.body(len(MAGIC), Opcode.HEADER)).library
     except BagError:
@@ -165,7 +165,7 @@ def _library(file: RecordFile) -> str:
 class _Walk:
     """A walk through the records of a file that has no usable summary."""
 
-    def __init__(self, file: RecordFile, problem: str = "") -> None:
+    def __init__(self, file: McapReader, problem: str = "") -> None:
         self._file = file
         self._found = Summary(library=_library(file), problem=problem)
         self._at = len(MAGIC)

@@ -1,6 +1,6 @@
 """Makes the records of a bag: messages in compressed chunks with an index, and what stands before them.
 
-`BagWriter` writes them into a file at once, or, without one, leaves them in `ready` for `r2p.recording.disk`. The
+`BagWriter` writes them into a file at once, or, without one, leaves them in `ready` for the `RecordingFiles`. The
 records of MCAP are those of the library `mcap`, except for messages and their index, of which there are too many.
 """
 
@@ -18,7 +18,7 @@ from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schem
 
 from r2p.errors import DecodeError, MessageError
 from r2p.recording.format import FORMAT, METADATA, PROFILE
-from r2p.recording.mcap_file import RECORD, McapFile, PackedChunk, message_index
+from r2p.recording.mcap_writer import RECORD, McapWriter, PackedChunk, message_index
 from r2p.version import __version__
 
 CHUNK_SIZE = 256 << 10
@@ -59,7 +59,7 @@ class BagWriter:
         self._parts: list[bytes] = []
         self._indexes: dict[int, list[int]] = {}
         self._size = 0
-        self._file = McapFile(file, profile=profile) if file is not None else None
+        self._file = McapWriter(file, profile=profile) if file is not None else None
         if about:
             self.add_metadata(METADATA, about)
 

@@ -11,11 +11,12 @@ from mcap.reader import make_reader
 
 from r2p.clock import clock_of
 from r2p.errors import TransportError
+from r2p.recording.background_writer import BackgroundWriter
 from r2p.recording.bag import Bag
-from r2p.recording.disk import Disk, RecordingOptions
 from r2p.recording.frame_player import FramePlayer
 from r2p.recording.frame_recorder import FrameRecorder
 from r2p.recording.frames import BusInfo, FrameEntry, frame_of
+from r2p.recording.recording_files import RecordingOptions
 from tests.can.rig import Candump, cangen, cansend, ip, until
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ pytestmark = [pytest.mark.can, pytest.mark.anyio]
 
 async def test_every_kind_of_frame_is_in_the_file(vcan: str, tmp_path: Path) -> None:
     path = tmp_path / "bus.mcap"
-    disk = Disk(path, RecordingOptions(), clock_of(), lambda _text: None)
+    disk = BackgroundWriter(path, RecordingOptions(), clock_of(), lambda _text: None)
     async with FrameRecorder(f"rtcan:{vcan}", disk.put) as recorder:
         for text in ("123#0102", "7FF#R3", "1ABCDE00#R8", "00000123#BB", "20000008#0000040000000000"):
             cansend(vcan, text)
@@ -50,7 +51,7 @@ async def test_every_frame_is_in_the_file_or_counted(vcan: str, tmp_path: Path) 
     """The loop stands still while frames come, more than the kernel keeps."""
     ip("set", "dev", vcan, "txqueuelen", "1000")
     count = 30_000
-    disk = Disk(tmp_path / "bus.mcap", RecordingOptions(), clock_of(), lambda _text: None)
+    disk = BackgroundWriter(tmp_path / "bus.mcap", RecordingOptions(), clock_of(), lambda _text: None)
     async with FrameRecorder(f"rtcan:{vcan}", disk.put) as recorder:
         cangen(vcan, count)
     await disk.close()
@@ -82,7 +83,7 @@ async def test_an_interface_that_goes_down_is_recorded_again(vcan: str) -> None:
 
 async def test_a_recording_is_played_onto_the_interface(vcan: str, tmp_path: Path) -> None:
     path = tmp_path / "bus.mcap"
-    disk = Disk(path, RecordingOptions(), clock_of(), lambda _text: None)
+    disk = BackgroundWriter(path, RecordingOptions(), clock_of(), lambda _text: None)
     texts = ["123#0102", "7FF#R3", "1ABCDE00#R8", "00000123#BB"]
     async with FrameRecorder(f"rtcan:{vcan}", disk.put) as recorder:
         for text in texts:
@@ -104,7 +105,7 @@ async def test_a_recording_is_played_onto_the_interface(vcan: str, tmp_path: Pat
 
 async def test_an_interface_that_can_not_be_played_onto_is_named(vcan: str, tmp_path: Path) -> None:
     path = tmp_path / "bus.mcap"
-    disk = Disk(path, RecordingOptions(), clock_of(), lambda _text: None)
+    disk = BackgroundWriter(path, RecordingOptions(), clock_of(), lambda _text: None)
     disk.put([FrameEntry(BusInfo("can0"), [(0x123, b"", 0, 0)])])
     await disk.close()
     with Bag(path) as bag:

@@ -16,13 +16,14 @@ RECORDER = """
     import asyncio, random, resource, sys
     import r2p
     from r2p.clock import clock_of
-    from r2p.recording.disk import Disk, RecordingOptions
+    from r2p.recording.background_writer import BackgroundWriter
+    from r2p.recording.recording_files import RecordingOptions
     from r2p.recording.entries import SampleEntry
 
     async def main(path, limit):
         if limit:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-        disk = Disk(path, RecordingOptions(), clock_of(), lambda text: print(text, flush=True))
+        disk = BackgroundWriter(path, RecordingOptions(), clock_of(), lambda text: print(text, flush=True))
         number = 0
         while not disk.stopped:
             entries = []

@@ -16,13 +16,14 @@ from r2p.clock import clock_of
 from r2p.codecs.can_bits import Frame
 from r2p.errors import BagError, TransportError
 from r2p.msg import Led
+from r2p.recording.background_writer import BackgroundWriter
 from r2p.recording.bag import Bag
-from r2p.recording.disk import Disk, RecordingOptions
 from r2p.recording.frame_player import FramePlayer
 from r2p.recording.frame_reader import BusReader, observe
 from r2p.recording.frame_recorder import FrameRecorder
 from r2p.recording.frames import BusInfo, FrameEntry
 from r2p.recording.pacing import Pacer
+from r2p.recording.recording_files import RecordingOptions
 from r2p.sim.can import CanNode
 from r2p.sim.transport import SimCan
 from r2p.transports.rtcan.transport import RtcanOptions
@@ -33,7 +34,7 @@ _channels = itertools.count()
 
 @contextlib.asynccontextmanager
 async def recording(path: Path, bus: SimCan, name: str = "lab") -> AsyncIterator[None]:
-    disk = Disk(path, RecordingOptions(min_free=0), clock_of(), lambda _text: None)
+    disk = BackgroundWriter(path, RecordingOptions(min_free=0), clock_of(), lambda _text: None)
     async with FrameRecorder(bus, disk.put, name=name):
         yield
     await disk.close()
@@ -158,7 +159,7 @@ async def test_a_bus_with_a_live_master_is_refused(tmp_path: Path) -> None:
 @pytest.mark.anyio
 async def test_frames_of_all_kinds_go_to_an_interface_of_python_can(tmp_path: Path) -> None:
     channel, path = f"play{next(_channels)}", tmp_path / "kinds.mcap"
-    disk = Disk(path, RecordingOptions(min_free=0), clock_of(), lambda _text: None)
+    disk = BackgroundWriter(path, RecordingOptions(min_free=0), clock_of(), lambda _text: None)
     kinds = [(0x123, b"abc"), (1 << 31 | 0x1234567, b"12345678"), (1 << 30 | 0x12, bytes(5)), (1 << 29 | 8, bytes(8))]
     disk.put([FrameEntry(BusInfo("can0"), [(*each, 0, SECOND) for each in kinds])])
     await disk.close()

@@ -9,7 +9,7 @@ import pytest
 
 from r2p.codecs.can_bits import ERROR, EXTENDED, REMOTE, Frame, WireFrame, frame_bits
 from r2p.errors import TransportError
-from r2p.recording.entries import Entry, MessageEntry
+from r2p.recording.entries import BagEntry, MessageEntry
 from r2p.recording.frame_recorder import FrameRecorder
 from r2p.recording.frames import BusInfo, FrameDetails, FrameEntry
 from r2p.sim.can import CanNode
@@ -21,10 +21,10 @@ MS = 1_000_000
 _channels = itertools.count()
 
 
-class Entries(list[Entry]):
+class Entries(list[BagEntry]):
     """What would be written."""
 
-    def put(self, entries: list[Entry]) -> None:
+    def put(self, entries: list[BagEntry]) -> None:
         self.extend(entries)
 
     @property
@@ -93,7 +93,7 @@ async def test_an_interface_of_python_can_is_recorded() -> None:
     channel = f"record{next(_channels)}"
     entries, arrived = Entries(), asyncio.Event()
 
-    def put(new: list[Entry]) -> None:
+    def put(new: list[BagEntry]) -> None:
         entries.extend(new)
         if len(entries.frames) == 4:
             arrived.set()

@@ -15,7 +15,7 @@ from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 
 from r2p.errors import BagError
-from r2p.recording.records import RecordFile
+from r2p.recording.mcap_reader import McapReader
 from r2p.recording.recovery import RecordingRecovery, RecoveryReport, recover
 from r2p.recording.writer import BagWriter
 from tests.recording.checker import HEADER, check, record_at
@@ -72,7 +72,7 @@ def test_a_file_that_is_cut_at_any_byte_is_recovered_up_to_the_cut(tmp_path: Pat
     for cut in range(len(BAG) - 1, 7, -1):
         os.truncate(source, cut)
         new = io.BytesIO()
-        with contextlib.closing(RecordFile(source)) as file:
+        with contextlib.closing(McapReader(source)) as file:
             *_, report = [RecoveryReport(), *RecordingRecovery(file, new).run()]
         if new.getvalue() not in checked:
             target.write_bytes(new.getvalue())

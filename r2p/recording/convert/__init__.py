@@ -3,7 +3,7 @@
 `formats` has the table of formats, and `convert`, which reads one and writes the other as a stream of `stream`. Each
 format is a module with two functions, `read` and `open_sink`, and is imported when a file of it is converted:
 
-    bags        our own recordings, and MCAP files of others
+    mcap_files  our own recordings, and MCAP files of others
     rosbag1     ROS 1
     rosbag2     ROS 2: a directory with metadata.yaml, or a database of SQLite
     candump     logs of CAN frames, as text

@@ -69,7 +69,7 @@ _HERE = "r2p.recording.convert"
 FORMATS = {
     each.name: each
     for each in (
-        Format("mcap", (".mcap",), f"{_HERE}.bags"),
+        Format("mcap", (".mcap",), f"{_HERE}.mcap_files"),
         Format("rosbag1", (".bag",), f"{_HERE}.rosbag1", version=1, extra="ros"),
         Format("rosbag2", (".mcap", ".db3", ".yaml"), f"{_HERE}.rosbag2", is_folder=True, is_file=False, extra="ros"),
         Format("db3", (".db3",), f"{_HERE}.rosbag2", extra="ros"),

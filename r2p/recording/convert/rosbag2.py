@@ -19,7 +19,7 @@ from r2p.errors import BagError, DecodeError, InvalidName, MessageError
 from r2p.messages import Message
 from r2p.names import topic_name
 from r2p.recording.bag_file import Attachment
-from r2p.recording.convert import bags
+from r2p.recording.convert import mcap_files
 from r2p.recording.convert.ros_messages import RosDecoder, ros_decoder, ros_schema
 from r2p.recording.convert.stream import ConversionOptions, ConvertedItem, ConvertedRecord, Losses, RecordSink
 from r2p.recording.entries import MetadataEntry
@@ -38,7 +38,7 @@ def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[Con
     try:
         files = _plain_files(path)
         if files:
-            yield from bags.read_files(files, options, losses)
+            yield from mcap_files.read_files(files, options, losses)
         else:
             yield from _by_rosbags(path, options, losses)
     except (ReaderError, yaml.YAMLError, UnicodeDecodeError) as error:
@@ -108,7 +108,7 @@ class Rosbag2Sink(RecordSink):
         path.mkdir()
         self._folder = path
         self._file = path / f"{path.name}_0.mcap"
-        self._bag = bags.BagSink(self._file, losses)
+        self._bag = mcap_files.BagSink(self._file, losses)
         self._problems: dict[tuple[str, type[Message] | None], str] = {}
         self._hashes = {schema_of(SampleMeta).name: ros2_hash(SampleMeta)}
 

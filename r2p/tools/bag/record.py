@@ -27,10 +27,10 @@ from r2p.tools.types import Types, is_service, load_service
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
-    from r2p.recording.disk import RecordingOptions
     from r2p.recording.entries import BagEntry
     from r2p.recording.frame_recorder import FrameRecorder
     from r2p.recording.recorder import Part, Recorder
+    from r2p.recording.recording_files import RecordingOptions
 
 SNAPSHOT_SERVICE = "bag/snapshot"
 """The service, of type std_srvs/Trigger, that writes the last seconds into a file."""
@@ -292,7 +292,7 @@ def _parts(settings: Settings, buses: "list[FrameRecorder] | None", *, events: b
 
 def _options(limits: Mapping[str, Any]) -> "RecordingOptions":
     """Return the options of the file. Raises UsageError for some that don't go together."""
-    from r2p.recording.disk import RecordingOptions  # only here, as it takes a while
+    from r2p.recording.recording_files import RecordingOptions  # only here, as it takes a while
 
     given = {name: value for name, value in limits.items() if value is not None}
     try:

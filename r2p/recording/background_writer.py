@@ -17,10 +17,8 @@ from typing import BinaryIO, Final, TypeVar
 from r2p.clock import Clock
 from r2p.errors import Closed
 from r2p.log_lines import get_logger
-from r2p.recording.entries import Entry
-from r2p.recording.files import RecordingFiles, RecordingOptions, open_new
-
-__all__ = ["Disk", "RecordingOptions"]
+from r2p.recording.entries import BagEntry
+from r2p.recording.recording_files import RecordingFiles, RecordingOptions, open_new
 
 R = TypeVar("R")
 
@@ -33,7 +31,7 @@ _PAUSE: Final = 100e-6  # s for that: released for less, the interpreter's lock 
 _HURRY: Final = 16  # the part of the queue's limit, 1/16, from which on there are no pauses
 
 
-class Disk:
+class BackgroundWriter:
     """Writes the entries of a recording into its files."""
 
     def __init__(
@@ -57,7 +55,7 @@ class Disk:
         self._dropped: Counter[str] = Counter()
         self._dropping = self._closed = False
         self._put_bytes = self._done_bytes = 0  # each is written by one thread only
-        self._jobs: queue.SimpleQueue[tuple[list[Entry], int] | Callable[[], bool]] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[tuple[list[BagEntry], int] | Callable[[], bool]] = queue.SimpleQueue()
         self._pause = threading.Lock()
         self._pause.acquire()  # for ever: to wait for it is to release the interpreter's lock
         self._files = RecordingFiles(Path(path), options, clock, self._notify, opened)
@@ -96,7 +94,7 @@ class Disk:
         """Memory of what waits for the disk."""
         return self._put_bytes - self._done_bytes
 
-    def put(self, entries: list[Entry]) -> None:
+    def put(self, entries: list[BagEntry]) -> None:
         """Hand entries over, in a list that is not used any more. Never waits: drops what does not fit the queue.
 
         Does nothing after `close`.
@@ -115,7 +113,7 @@ class Disk:
         self._put_bytes += size
         self._jobs.put((entries, size))
 
-    def _fitting(self, entries: list[Entry]) -> tuple[list[Entry], int]:
+    def _fitting(self, entries: list[BagEntry]) -> tuple[list[BagEntry], int]:
         """Return the entries that fit the queue, and their size; count the others."""
         room = self._limit - self.queued_bytes
         fitting, size = [], 0
@@ -182,7 +180,7 @@ class Disk:
                     self._pause.acquire(timeout=_PAUSE)
             self._done_bytes += size
 
-    def _write(self, entries: list[Entry]) -> None:
+    def _write(self, entries: list[BagEntry]) -> None:
         try:
             self._files.write(entries)
             self._files.tick()

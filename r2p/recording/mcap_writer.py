@@ -150,7 +150,7 @@ class _Written(msgspec.Struct, frozen=True, gc=False):
     end: int = 0
 
 
-class McapFile:
+class McapWriter:
     """A file that is being written. `size`: its bytes so far; `summary_size`: those that `finish` adds at the most."""
 
     def __init__(self, file: BinaryIO, *, profile: str = PROFILE) -> None:

@@ -14,9 +14,9 @@ import msgspec
 from r2p.clock import Clock
 from r2p.errors import Error
 from r2p.log_lines import get_logger
-from r2p.recording.entries import Entry, EntryWriter
+from r2p.recording.entries import BagEntry, EntryWriter
 from r2p.recording.format import META_PREFIX
-from r2p.recording.mcap_file import McapFile, PackedChunk
+from r2p.recording.mcap_writer import McapWriter, PackedChunk
 from r2p.recording.writer import BagWriter
 from r2p.units import MILLISECOND, SECOND
 
@@ -138,7 +138,7 @@ class RecordingFiles:
         self._began = clock.monotonic()
         self._chunk_due, self._sync_due = self._began + _CHUNK_EVERY, self._began + _SYNC_EVERY
         self._raw: BinaryIO | None = None
-        self._file: McapFile | None = None
+        self._file: McapWriter | None = None
         if (free := self._free()) < options.min_free:
             raise Error(f"{path} has only {_size(free)} of disk: {_size(options.min_free)} are to stay free (min_free)")
         if not options.snapshot:
@@ -152,7 +152,7 @@ class RecordingFiles:
 
     # Entries
 
-    def write(self, entries: Iterable[Entry]) -> None:
+    def write(self, entries: Iterable[BagEntry]) -> None:
         """Write entries into chunks, and full chunks into the file."""
         if self.stopped:
             self._refuse(entries)
@@ -164,7 +164,7 @@ class RecordingFiles:
                 self._refuse([entry], error)
         self._write_out()
 
-    def _refuse(self, entries: Iterable[Entry], error: Exception | None = None) -> None:
+    def _refuse(self, entries: Iterable[BagEntry], error: Exception | None = None) -> None:
         """Count entries that are not recorded; not those behind a limit that the user set."""
         if self.stopped and not self._failed:
             return
@@ -256,7 +256,7 @@ class RecordingFiles:
         """Create the next file. Raises OSError; then there is none."""
         path, raw = self._create()
         try:
-            file = McapFile(raw)
+            file = McapWriter(raw)
         except OSError:
             _discard(raw, path)
             raise
@@ -305,7 +305,7 @@ class RecordingFiles:
         if not self._clock.virtual:
             os.fdatasync(raw.fileno())
 
-    def _close(self, raw: BinaryIO, file: McapFile) -> None:
+    def _close(self, raw: BinaryIO, file: McapWriter) -> None:
         with contextlib.suppress(OSError):
             self._syncing.join()
         with contextlib.suppress(OSError):
@@ -315,7 +315,7 @@ class RecordingFiles:
         self.finished_bytes += file.size
         self._sizes[self.paths[-1]] = file.size
 
-    def _finish_with_room(self, file: McapFile) -> None:
+    def _finish_with_room(self, file: McapWriter) -> None:
         while True:
             try:
                 file.finish()
@@ -427,7 +427,7 @@ class RecordingFiles:
         self._close(raw, file)
         return path
 
-    def _fill(self, file: McapFile) -> None:
+    def _fill(self, file: McapWriter) -> None:
         for record in self.writer.registered:
             file.write(record)
         for chunk in self._ring:

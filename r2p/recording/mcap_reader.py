@@ -70,7 +70,7 @@ class ChunkRef(msgspec.Struct, frozen=True, gc=False):
     real: bool = True
 
 
-class RecordFile:
+class McapReader:
     """An open MCAP file. `size` is that of the file when it was opened: a recorder may go on writing."""
 
     def __init__(self, path: Path) -> None:

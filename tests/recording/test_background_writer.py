@@ -20,9 +20,10 @@ import r2p
 import r2p.sim
 from r2p.clock import clock_of
 from r2p.msg import Led
+from r2p.recording.background_writer import BackgroundWriter
 from r2p.recording.bag import Bag
-from r2p.recording.disk import Disk, RecordingOptions
-from r2p.recording.entries import AttachmentEntry, Entry, EntryWriter, MessageEntry, MetadataEntry, SampleEntry
+from r2p.recording.entries import AttachmentEntry, BagEntry, EntryWriter, MessageEntry, MetadataEntry, SampleEntry
+from r2p.recording.recording_files import RecordingOptions
 from r2p.recording.recovery import recover
 from tests.recording.checker import check
 
@@ -36,7 +37,7 @@ def led(number: int) -> SampleEntry:
     return SampleEntry("leds", r2p.Sample(noise, source, 1_000, sequence=number), None, clock_of().now())
 
 
-def leds(count: int, first: int = 1) -> list[Entry]:
+def leds(count: int, first: int = 1) -> list[BagEntry]:
     return [led(number) for number in range(first, first + count)]
 
 
@@ -54,10 +55,10 @@ class Reports(list[str]):
 
 def open_disk(
     path: Path, *, opened: Callable[[Path], BinaryIO] | None = None, **options: float
-) -> tuple[Disk, Reports]:
+) -> tuple[BackgroundWriter, Reports]:
     reports = Reports()
     more = {} if opened is None else {"opened": opened}
-    return Disk(path, RecordingOptions(**options), clock_of(), reports, **more), reports  # type: ignore[arg-type]
+    return BackgroundWriter(path, RecordingOptions(**options), clock_of(), reports, **more), reports  # type: ignore[arg-type]
 
 
 # What is in a file
@@ -102,7 +103,7 @@ async def test_after_half_a_second_a_message_is_in_the_file(tmp_path: Path) -> N
     await disk.close()
 
 
-class BadEntry(Entry):
+class BadEntry(BagEntry):
     """An entry that raises."""
 
     @property
@@ -202,7 +203,7 @@ class QuotaFile(io.FileIO):
         return super().write(memoryview(data)[:free])
 
 
-async def record(disk: Disk, count: int, each: int = 10) -> None:
+async def record(disk: BackgroundWriter, count: int, each: int = 10) -> None:
     for first in range(1, count, each):
         disk.put(leds(each, first))
         await asyncio.sleep(0.1)
