@@ -335,7 +335,7 @@ class Bag:
             settled = done[number]
             settled.update(channel for (file, channel), at in last.items() if file == number and at >= chunk.end)
             wanted = (ids or frozenset()) - settled
-            if chunk.channels is None or not wanted.isdisjoint(chunk.channels):
+            if chunk.may_have(wanted):
                 for message in self._read(number, chunk, wanted, 0, time):
                     key = (number, message[1])
                     last[key] = max(message[0], last.get(key, 0))
@@ -383,7 +383,7 @@ class Bag:
             ids = None if wanted is None else frozenset(key for key, each in file.channels.items() if wanted(each))
             for chunk in file.summary.chunks:
                 is_in_time = chunk.end >= start and chunk.start < end
-                if is_in_time and (ids is None or chunk.channels is None or not ids.isdisjoint(chunk.channels)):
+                if is_in_time and (ids is None or chunk.may_have(ids)):
                     found.append((chunk, number, ids))
         found.sort(key=lambda each: (each[0].start, each[1], each[0].offset))
         return found

@@ -13,8 +13,8 @@ from mcap.records import Metadata as MetadataRecord
 
 from r2p.errors import BagError
 from r2p.recording.channels import BagChannel, channels_of
-from r2p.recording.format import FORMAT, METADATA
-from r2p.recording.mcap_reader import RECORD_HEAD, TIME_MAX, ChunkRef, McapReader, RawMessage, messages, parse
+from r2p.recording.format import FORMAT, METADATA, RECORD_HEAD
+from r2p.recording.mcap_reader import TIME_MAX, ChunkRef, McapReader, RawMessage, messages, parse
 from r2p.recording.summary import Summary, read_summary
 
 SUFFIX = ".mcap"

@@ -148,7 +148,7 @@ class _Cut:
         for chunk, number in sorted(chunks, key=lambda each: (each[0].start, each[1], each[0].offset)):
             file, ids = self._bag.files[number], self._ids[number]
             is_empty = chunk.end < start or chunk.start >= end
-            if is_empty or (chunk.channels is not None and chunk.channels.isdisjoint(ids)):
+            if is_empty or not chunk.may_have(ids):
                 continue
             if not self._copy(file, chunk, ids):
                 self._reread(file, chunk, ids)

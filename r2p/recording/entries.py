@@ -11,7 +11,7 @@ from typing import Any, ClassVar, TypeVar
 import msgspec
 
 from r2p.messages import Message
-from r2p.recording.format import CDR, ROS2MSG, SEQUENCE_MASK
+from r2p.recording.format import CDR, SEQUENCE_MASK
 from r2p.recording.samples import SampleWriter
 from r2p.recording.types import schema_of
 from r2p.recording.writer import BagWriter
@@ -165,7 +165,7 @@ class EntryWriter:
         key = name, cls, tuple(metadata.items())
         channel = self._channels.get(key)
         if channel is None:
-            schema = schema_of(cls)
-            text = schema.name, ROS2MSG, schema.text.encode()
-            channel = self._channels[key] = OwnChannel(self.writer.add_channel(name, CDR, metadata, text))
+            channel = self._channels[key] = OwnChannel(
+                self.writer.add_channel(name, CDR, metadata, schema_of(cls).record)
+            )
         return channel

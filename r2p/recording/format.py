@@ -21,8 +21,9 @@ Each file of a recording that was split has all channels, attachments and metada
 same ids.
 """
 
+import struct
 from collections.abc import Mapping
-from typing import Self
+from typing import Final, Self
 
 import msgspec
 
@@ -49,6 +50,21 @@ META_PREFIX = f"{OWN_PREFIX}meta/"
 """Before the name of a topic: the channel of the companion."""
 
 SEQUENCE_MASK = 0xFFFF_FFFF
+
+# Records of MCAP: of those that the library `mcap` reads and writes too slowly
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+"""The beginning of a file, and its end."""
+RECORD_HEAD: Final = struct.Struct("<BQ")
+"""Of each record: its opcode, and the bytes behind this."""
+MESSAGE: Final = struct.Struct("<HIQQ")
+"""Of a message, before its data: channel, sequence, log time, publish time."""
+MESSAGE_RECORD: Final = struct.Struct("<BQHIQQ")
+"""Both in one."""
+INDEX: Final = struct.Struct("<HI")
+"""Of a channel's index behind a chunk, before its entries: channel, and the bytes of all entries."""
+INDEX_ENTRY: Final = 16
+"""Bytes of one: log time, and offset in the chunk."""
 
 
 class ChannelInfo(msgspec.Struct, frozen=True):

@@ -24,7 +24,7 @@ from r2p.errors import DecodeError
 from r2p.messages import Len, Max, Message, i64, u8, u32, u64
 from r2p.msg import Header
 from r2p.recording.entries import BagEntry, EntryWriter
-from r2p.recording.format import CDR, ROS2MSG, SEQUENCE_MASK
+from r2p.recording.format import CDR, SEQUENCE_MASK
 from r2p.recording.types import schema_of
 from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import HEADER as CDR_HEADER
@@ -196,9 +196,8 @@ class _WrittenBus:
     def channel(self, *, sent: bool) -> int:
         """Return the channel of one direction."""
         if sent not in self._channels:
-            schema = schema_of(CanFrame)
-            text = schema.name, ROS2MSG, schema.text.encode()
-            self._channels[sent] = self._writer.add_channel(self._bus.topic, CDR, self._bus.metadata(sent=sent), text)
+            schema, metadata = schema_of(CanFrame).record, self._bus.metadata(sent=sent)
+            self._channels[sent] = self._writer.add_channel(self._bus.topic, CDR, metadata, schema)
         return self._channels[sent]
 
 

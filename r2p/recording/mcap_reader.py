@@ -7,7 +7,7 @@ stands in the file: records are never longer than the rest of the file, and chun
 import itertools
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, TypeVar
@@ -18,15 +18,12 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from r2p.errors import BagError
+from r2p.recording.format import MAGIC, MESSAGE, MESSAGE_RECORD, RECORD_HEAD
 
 if TYPE_CHECKING:
     from collections.abc import Container
 
 R = TypeVar("R")
-
-MAGIC: Final = b"\x89MCAP0\r\n"
-RECORD_HEAD: Final = struct.Struct("<BQ")
-"""Of each record: its opcode, and the bytes behind this."""
 
 CHUNK_MAX: Final = 1 << 28
 """Bytes of messages in one chunk, at most; of a larger one nothing is read."""
@@ -37,8 +34,6 @@ TIME_MAX: Final = (1 << 64) - 1
 _RECORD_MAX: Final = 1 << 28  # bytes of a record that is neither a chunk nor an attachment
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # start, end, size, CRC, length of the name of the compression
 _LENGTH: Final = struct.Struct("<Q")
-_MESSAGE: Final = struct.Struct("<BQHIQQ")
-_FIXED: Final = _MESSAGE.size - RECORD_HEAD.size  # bytes of a message record besides its data
 _AT_ONCE: Final = 1 << 24  # bytes that are unpacked in one go
 _STEP: Final = 1 << 20  # ... and in several: each of this size
 _OTHERS: Final = {
@@ -68,6 +63,10 @@ class ChunkRef(msgspec.Struct, frozen=True, gc=False):
     size: int = 0  # bytes of the messages when they are unpacked
     channels: frozenset[int] | None = None
     real: bool = True
+
+    def may_have(self, channels: Iterable[int]) -> bool:
+        """Return whether there may be messages of one of these channels in it."""
+        return self.channels is None or not self.channels.isdisjoint(channels)
 
 
 class McapReader:
@@ -247,13 +246,13 @@ def messages(data: bytes, wanted: "Container[int] | None", start: int, end: int)
     What follows a record that is cut is left out.
     """
     found: list[RawMessage] = []
-    unpack, add, at, size = _MESSAGE.unpack_from, found.append, 0, len(data)
-    while at + _MESSAGE.size <= size:
+    unpack, add, at, size = MESSAGE_RECORD.unpack_from, found.append, 0, len(data)
+    while at + MESSAGE_RECORD.size <= size:
         opcode, length, channel, sequence, log_time, publish_time = unpack(data, at)
-        begin, at = at + _MESSAGE.size, at + RECORD_HEAD.size + length
+        begin, at = at + MESSAGE_RECORD.size, at + RECORD_HEAD.size + length
         if opcode != Opcode.MESSAGE:
             continue
-        if length < _FIXED or at > size:
+        if length < MESSAGE.size or at > size:
             break
         if start <= log_time < end and (wanted is None or channel in wanted):
             add((log_time, channel, sequence, publish_time, data[begin:at]))

@@ -31,20 +31,14 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.writer import MCAP0_MAGIC
 
 from r2p.errors import DecodeError
-from r2p.recording.format import PROFILE
+from r2p.recording.format import INDEX, INDEX_ENTRY, MAGIC, PROFILE, RECORD_HEAD
 from r2p.version import __version__
 
 LIBRARY = f"r2p {__version__}"
 
-RECORD = struct.Struct("<BQ")
-"""Before each record: its opcode, and the length of what follows."""
-
-_INDEX = struct.Struct("<BQHI")  # before a channel's pairs (log time, offset), 16 bytes each
-_PAIR = 16
-_LINE_SIZE = RECORD.size + 64  # bytes of a chunk in the summary, without its channels and its compression
+_LINE_SIZE = RECORD_HEAD.size + 64  # bytes of a chunk in the summary, without its channels and its compression
 _PER_CHANNEL = 10  # bytes of a number of a channel
 _FOOTER_IN_CRC = struct.Struct("<BQQQ")
 _GROUPS = Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX
@@ -121,22 +115,23 @@ def _channels(index: bytes) -> Iterator[tuple[int, ChunkMessages]]:
     position, seen = 0, set()
     while position < len(index):
         try:
-            opcode, length, channel, size = _INDEX.unpack_from(index, position)
+            opcode, length = RECORD_HEAD.unpack_from(index, position)
+            channel, size = INDEX.unpack_from(index, position + RECORD_HEAD.size)
         except struct.error:
             raise DecodeError("the index of a chunk is cut short") from None
-        fits = length == size + _INDEX.size - RECORD.size and size % _PAIR == 0
+        fits = length == INDEX.size + size and size % INDEX_ENTRY == 0
         if opcode != Opcode.MESSAGE_INDEX or not fits or channel in seen:
             raise DecodeError("the index of a chunk is damaged")
         seen.add(channel)
-        yield channel, ChunkMessages(size // _PAIR, position)
-        position += _INDEX.size + size
+        yield channel, ChunkMessages(size // INDEX_ENTRY, position)
+        position += RECORD_HEAD.size + length
     if position > len(index):
         raise DecodeError("the index of a chunk is cut short")
 
 
 def message_index(channel: int, pairs: bytes) -> bytes:
     """Return the index of a channel's messages in a chunk: pairs of log time and offset, packed."""
-    return _INDEX.pack(Opcode.MESSAGE_INDEX, _INDEX.size - RECORD.size + len(pairs), channel, len(pairs)) + pairs
+    return RECORD_HEAD.pack(Opcode.MESSAGE_INDEX, INDEX.size + len(pairs)) + INDEX.pack(channel, len(pairs)) + pairs
 
 
 class _Written(msgspec.Struct, frozen=True, gc=False):
@@ -163,7 +158,7 @@ class McapWriter:
         self._channels: dict[int, bytes] = {}
         self._counts: Counter[int] = Counter()
         self.summary_size = 1 << 10  # the records of a fixed size at the end have less
-        self._put(MCAP0_MAGIC + packed(Header(profile, LIBRARY)))
+        self._put(MAGIC + packed(Header(profile, LIBRARY)))
 
     def write(self, item: McapRecord | PackedChunk) -> None:
         """Write a chunk, or a record that stands outside of chunks."""
@@ -226,7 +221,7 @@ class McapWriter:
             group.write(builder)
         summary = builder.end()
         crc = zlib.crc32(_FOOTER_IN_CRC.pack(Opcode.FOOTER, 20, start, offsets), zlib.crc32(summary))
-        self._put(end + summary + packed(Footer(start, offsets, crc)) + MCAP0_MAGIC)
+        self._put(end + summary + packed(Footer(start, offsets, crc)) + MAGIC)
         self._file.flush()
 
     def _summary(self) -> Iterator[tuple[Opcode, list[bytes]]]:
@@ -273,9 +268,9 @@ class McapWriter:
         """Return the last chunk, which stands there."""
         self._file.seek(position)
         data = self._file.read(self.size - position)
-        length = RECORD.size + RECORD.unpack_from(data)[1]
+        length = RECORD_HEAD.size + RECORD_HEAD.unpack_from(data)[1]
         record: Any = Chunk
-        return PackedChunk.make(record.read(ReadDataStream(io.BytesIO(data[RECORD.size : length]))), data[length:])
+        return PackedChunk.make(record.read(ReadDataStream(io.BytesIO(data[RECORD_HEAD.size : length]))), data[length:])
 
     def _put(self, data: bytes) -> None:
         rest = memoryview(data)

@@ -18,11 +18,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema
 
 from r2p.errors import BagError, DecodeError
-from r2p.recording.format import META_PREFIX
+from r2p.recording.format import MAGIC, MESSAGE, META_PREFIX, RECORD_HEAD
 from r2p.recording.mcap_reader import (
     CHUNK_MAX,
-    MAGIC,
-    RECORD_HEAD,
     McapReader,
     RawMessage,
     messages,
@@ -34,7 +32,6 @@ from r2p.recording.mcap_reader import (
 from r2p.recording.writer import BagWriter
 from r2p.units import NEVER, SECOND
 
-_MESSAGE: Final = struct.Struct("<HIQQ")  # outside of chunks: channel, sequence, log time, publish time
 _COMPRESSIONS: Final = b"\4\0\0\0zstd", b"\3\0\0\0lz4"  # with the length in front
 _NAME_AT: Final = RECORD_HEAD.size + 28  # of the compression, with its length, in the record of a chunk
 _FOOTER_BODY: Final = 20  # bytes
@@ -214,8 +211,8 @@ class RecordingRecovery:
                 case Opcode.CHANNEL:
                     self._channel(parse(Channel, content))
                 case Opcode.MESSAGE:
-                    channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(content)
-                    self._message((log_time, channel, sequence, publish_time, content[_MESSAGE.size :]))
+                    channel, sequence, log_time, publish_time = MESSAGE.unpack_from(content)
+                    self._message((log_time, channel, sequence, publish_time, content[MESSAGE.size :]))
                 case Opcode.CHUNK:
                     return self._chunk(content)
                 case Opcode.ATTACHMENT:

@@ -8,7 +8,7 @@ import msgspec
 
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import ClockOffset, Message, layout
-from r2p.recording.format import CDR, META_PREFIX, PACKED, ROS2MSG, SEQUENCE_MASK, ChannelInfo
+from r2p.recording.format import CDR, META_PREFIX, PACKED, SEQUENCE_MASK, ChannelInfo
 from r2p.recording.messages import REST_MAX, SampleMeta
 from r2p.recording.types import Ros2Schema, schema_of, type_of
 from r2p.recording.writer import BagWriter
@@ -63,14 +63,15 @@ class SampleWriter:
         schema = None
         if cls is not None:
             info, schema = _typed(info, cls)
-        number = self._writer.add_channel(f"/{topic}", CDR if schema else PACKED, info.metadata, _mcap_schema(schema))
+        encoding, text = (PACKED, None) if schema is None else (CDR, schema.record)
+        number = self._writer.add_channel(f"/{topic}", encoding, info.metadata, text)
         to_cdr = transcoder(cls).to_cdr if schema is not None and cls is not None else None
         self._channels[key] = made = _SampleChannel(number, info, to_cdr)
         return made
 
     def _companion(self, channel: "_SampleChannel") -> int:
         if not channel.companion:
-            name, schema = f"{META_PREFIX}{channel.info.topic}", _mcap_schema(schema_of(SampleMeta))
+            name, schema = f"{META_PREFIX}{channel.info.topic}", schema_of(SampleMeta).record
             channel.companion = self._writer.add_channel(name, CDR, channel.info.metadata, schema)
         return channel.companion
 
@@ -101,10 +102,6 @@ def _typed(info: ChannelInfo, cls: type[Message]) -> tuple[ChannelInfo, Ros2Sche
         if other is not None and transcoder(other).to_cdr(zero) == transcoder(cls).to_cdr(zero):
             return typed, schema
     return (info if type_of(typed) is None else typed), None
-
-
-def _mcap_schema(schema: Ros2Schema | None) -> tuple[str, str, bytes] | None:
-    return (schema.name, ROS2MSG, schema.text.encode()) if schema is not None else None
 
 
 def _meta(sample: Sample, rest: bytes) -> SampleMeta:

@@ -14,9 +14,8 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Footer, Header, MetadataIndex, Schema, Statistics
 
 from r2p.errors import BagError
+from r2p.recording.format import INDEX, INDEX_ENTRY, MAGIC, MESSAGE, RECORD_HEAD
 from r2p.recording.mcap_reader import (
-    MAGIC,
-    RECORD_HEAD,
     TIME_MAX,
     ChunkRef,
     McapReader,
@@ -33,9 +32,6 @@ _CHANNEL_OFFSET: Final = 10  # bytes of an id and an offset
 _SIZES: Final = struct.Struct("<QQ")
 _ATTACHMENT_HEAD: Final = 4096  # bytes in which the names of an attachment are
 _ATTACHMENT: Final = struct.Struct("<QQI")  # times, length of the name
-_TIMES: Final = struct.Struct("<HIQQ")
-_INDEX_HEAD: Final = struct.Struct("<HI")
-_INDEX_ENTRY: Final = 16  # bytes of a time and an offset
 
 
 class Summary(msgspec.Struct, eq=False):
@@ -203,9 +199,9 @@ class _Walk:
                 self._message(length)
             case Opcode.CHUNK:
                 self._chunk = self._file.chunk_head(self._at, length)
-            case Opcode.MESSAGE_INDEX if length >= _INDEX_HEAD.size:
-                channel, entries = _INDEX_HEAD.unpack(self._file.read(body, _INDEX_HEAD.size))
-                self._in_chunk[channel] += min(entries, length - _INDEX_HEAD.size) // _INDEX_ENTRY
+            case Opcode.MESSAGE_INDEX if length >= INDEX.size:
+                channel, entries = INDEX.unpack(self._file.read(body, INDEX.size))
+                self._in_chunk[channel] += min(entries, length - INDEX.size) // INDEX_ENTRY
             case Opcode.SCHEMA | Opcode.CHANNEL:
                 self._found.add(opcode, self._file.body(self._at, opcode))
             case Opcode.METADATA:
@@ -215,9 +211,9 @@ class _Walk:
 
     def _message(self, length: int) -> None:
         """Enter a message outside of a chunk."""
-        if length < _TIMES.size:
+        if length < MESSAGE.size:
             raise BagError("a message is too short")
-        channel, _, log_time, _ = _TIMES.unpack(self._file.read(self._at + RECORD_HEAD.size, _TIMES.size))
+        channel, _, log_time, _ = MESSAGE.unpack(self._file.read(self._at + RECORD_HEAD.size, MESSAGE.size))
         if self._piece and self._at - self._piece[2] >= _PIECE:
             self._end_piece()
         first, last, offset = self._piece or (log_time, log_time, self._at)

@@ -8,7 +8,7 @@ import msgspec
 from r2p.errors import MessageError
 from r2p.messages import Message, layout
 from r2p.messages.schemas import message_type
-from r2p.recording.format import ChannelInfo
+from r2p.recording.format import ROS2MSG, ChannelInfo
 from r2p.ros.classes import RosTypes, definitions_of, standard_classes
 from r2p.ros.definitions import definition_text, parse
 from r2p.ros.type_names import ros2_name, short_name
@@ -25,6 +25,11 @@ class Ros2Schema(msgspec.Struct, frozen=True):
 
     name: str
     text: str
+
+    @property
+    def record(self) -> tuple[str, str, bytes]:
+        """The schema as `BagWriter.add_channel` takes it: name, encoding and text."""
+        return self.name, ROS2MSG, self.text.encode()
 
 
 @functools.lru_cache(maxsize=1024)

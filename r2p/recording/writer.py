@@ -4,7 +4,6 @@
 records of MCAP are those of the library `mcap`, except for messages and their index, of which there are too many.
 """
 
-import struct
 import sys
 import zlib
 from array import array
@@ -17,8 +16,8 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 
 from r2p.errors import DecodeError, MessageError
-from r2p.recording.format import FORMAT, METADATA, PROFILE
-from r2p.recording.mcap_writer import RECORD, McapWriter, PackedChunk, message_index
+from r2p.recording.format import FORMAT, MESSAGE, MESSAGE_RECORD, METADATA, PROFILE
+from r2p.recording.mcap_writer import McapWriter, PackedChunk, message_index
 from r2p.version import __version__
 
 CHUNK_SIZE = 256 << 10
@@ -27,8 +26,6 @@ CHUNK_SIZE = 256 << 10
 ABOUT: Final = {"format": f"{FORMAT}", "r2p": __version__}
 """What the metadata record `r2p` says."""
 
-_MESSAGE = struct.Struct("<BQHIQQ")  # a message's record up to its data: channel, sequence, log time, publish time
-_FIXED = _MESSAGE.size - RECORD.size
 _IDS_MAX = 0xFFFF
 
 
@@ -114,7 +111,7 @@ class BagWriter:
 
     def add(self, channel: int, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
         """Write a message; times in ns since 1970."""
-        head = _MESSAGE.pack(Opcode.MESSAGE, _FIXED + len(data), channel, sequence, log_time, publish_time)
+        head = MESSAGE_RECORD.pack(Opcode.MESSAGE, MESSAGE.size + len(data), channel, sequence, log_time, publish_time)
         size = self._size
         self._indexes[channel] += (log_time, size)
         self._parts += (head, data)

@@ -142,9 +142,8 @@ class BagSink(RecordSink):
     ) -> Callable[[ConvertedRecord], None]:
         """Return what writes messages of a channel that is not one of a topic."""
         assert record.cls is not None
-        schema, to_cdr = schema_of(record.cls), transcoder(record.cls).to_cdr
-        text = schema.name, ROS2MSG, schema.text.encode()
-        channel = self.writer.add_channel(f"/{record.topic}", CDR, metadata, text)
+        schema, to_cdr = schema_of(record.cls).record, transcoder(record.cls).to_cdr
+        channel = self.writer.add_channel(f"/{record.topic}", CDR, metadata, schema)
 
         def write(record: ConvertedRecord) -> None:
             sample = record.sample

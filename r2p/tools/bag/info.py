@@ -140,7 +140,7 @@ def _rate(bag: "Bag", channels: "list[BagChannel]", count: int) -> float | None:
     found = []
     for file in bag.files:
         ids = frozenset(number for number, each in file.channels.items() if each.key in keys)
-        chunks = [each for each in file.summary.chunks if each.channels is None or not ids.isdisjoint(each.channels)]
+        chunks = [each for each in file.summary.chunks if each.may_have(ids)]
         if chunks:
             found += [(file, min(chunks, key=lambda each: each.start), ids)]
             found += [(file, max(chunks, key=lambda each: each.end), ids)]
@@ -184,7 +184,7 @@ def _chunks_with(bag: "Bag", channel: str) -> int:
     found = 0
     for file in bag.files:
         ids = {number for number, each in file.channels.items() if each.name == channel}
-        found += sum(each.channels is None or not ids.isdisjoint(each.channels) for each in file.summary.chunks)
+        found += sum(each.may_have(ids) for each in file.summary.chunks)
     return found
 
 
@@ -211,7 +211,7 @@ def _last_chunk(bag: "Bag", channel: str) -> int:
     starts = []
     for file in bag.files:
         ids = {number for number, each in file.channels.items() if each.name == channel}
-        found = [each for each in file.summary.chunks if each.channels is None or not ids.isdisjoint(each.channels)]
+        found = [each for each in file.summary.chunks if each.may_have(ids)]
         starts += [max(each.start for each in found)] if found else []
     return min(starts, default=0)
 
