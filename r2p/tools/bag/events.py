@@ -48,7 +48,7 @@ async def events(
     each: Annotated[bool, typer.Option("--each", help="A line for each miss, also for those within a second.")] = False,
     format: Format = None,
 ) -> None:
-    """Print what happened: links, elections, slots, missed deadlines.
+    """Print what happened: links, elections, slots, misses.
 
     Also changes of parameters, warnings and losses. `r2p bag record` writes it besides the topics. At a terminal, what
     repeats within a second is one line.
