@@ -67,7 +67,7 @@ async def merge(
     exclude: Exclude = None,
     format: Format = None,
 ) -> None:
-    """Write several recordings into one new file, in the order of time.
+    """Write several recordings into one, in the order of time.
 
     For example r2p bag merge robot.mcap laptop.mcap -o all.mcap --offset laptop.mcap=-2.5. With --offset, stamps and
     deadlines move as log times do; times inside of messages stay.
