@@ -11,12 +11,22 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
-from r2p.errors import BagError, DecodeError, MessageError
+from r2p.errors import BagError, MessageError
 from r2p.messages import FixedArray, Message, Nested, Shape, VariableArray, layout
 from r2p.messages.shapes import SIZE_MAX
 from r2p.messages.values import flatten, from_plain, is_octets, to_plain
-from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
-from r2p.recording.convert.tables import CONTEXT, DATA, TablePaths, by_time, context_of, record_of, tables
+from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses
+from r2p.recording.convert.tables import (
+    CONTEXT,
+    DATA,
+    Table,
+    TablePaths,
+    TableSink,
+    by_time,
+    context_of,
+    record_of,
+    tables,
+)
 
 _SUFFIX = ".csv"
 _LINE_MAX = 3 * SIZE_MAX  # characters
@@ -78,56 +88,25 @@ def _value(shape: Shape, path: str, row: Mapping[str, Any]) -> Any:
             return row.get(path)
 
 
-def open_sink(path: Path, options: ConversionOptions, losses: Losses) -> "CsvSink":
+def open_sink(path: Path, options: ConversionOptions, losses: Losses) -> TableSink:
     """Begin a file, or a folder of files."""
-    return CsvSink(path, options, losses)
+    return TableSink(TablePaths(path, _SUFFIX, options), CsvTable, losses)
 
 
-class CsvSink(RecordSink):
-    """Writes tables."""
-
-    def __init__(self, path: Path, options: ConversionOptions, losses: Losses) -> None:
-        super().__init__(losses)
-        self._paths = TablePaths(path, _SUFFIX, options)
-        self._tables: dict[str, _WrittenTable | str] = {}
-
-    def put(self, record: ConvertedRecord) -> bool:
-        if record.topic not in self._tables:
-            path = self._paths.find(record)
-            self._tables[record.topic] = path if isinstance(path, str) else _WrittenTable(path, record.cls)
-        table = self._tables[record.topic]
-        if isinstance(table, str):
-            return self.lose(table)
-        problem = table.write(record)
-        return self.lose(problem) if problem else True
-
-    def finish(self) -> None:
-        """The tables are complete."""
-
-    def close(self) -> None:
-        for each in self._tables.values():
-            if isinstance(each, _WrittenTable):
-                each.file.close()
-
-
-class _WrittenTable:
-    """The file of one topic, with the columns of one type."""
+class CsvTable(Table):
+    """The file of one topic."""
 
     def __init__(self, path: Path, cls: type[Message] | None) -> None:
-        self.file: TextIO = path.open("x", newline="", encoding="utf-8")
-        self._cls = cls
-        self._rows = csv.writer(self.file, lineterminator="\n")
+        super().__init__(cls)
+        self._file: TextIO = path.open("x", newline="", encoding="utf-8")
+        self._rows = csv.writer(self._file, lineterminator="\n")
         columns = [DATA] if cls is None else list(flatten(to_plain(layout(cls).zero, "cells")))
         self._rows.writerow([*CONTEXT, *columns])
 
-    def write(self, record: ConvertedRecord) -> str:
-        """Write a row; return in words what is lost if it has no place here, and else nothing."""
-        if record.cls is not self._cls:
-            return f"messages of {record.topic} of another type than the first"
-        data = record.sample.data
-        try:
-            values = [data.hex()] if self._cls is None else flatten(to_plain(self._cls.decode(data), "cells")).values()
-        except DecodeError:
-            return f"messages of {record.topic} of another type than {record.type_name}"
+    def add(self, record: ConvertedRecord, message: Message | None) -> str:
+        values = [record.sample.data.hex()] if message is None else flatten(to_plain(message, "cells")).values()
         self._rows.writerow([*context_of(record), *values])
         return ""
+
+    def close(self) -> None:
+        self._file.close()

@@ -12,16 +12,18 @@ from typing import Any
 import pyarrow as pa
 from pyarrow import parquet as pq
 
-from r2p.errors import BagError, DecodeError, MessageError
+from r2p.errors import BagError, MessageError
 from r2p.messages import Chars, FixedArray, Message, Nested, Scalar, Shape, VariableArray, VariableText, layout
 from r2p.messages.values import from_plain, is_octets
-from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
+from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses
 from r2p.recording.convert.tables import (
     CONTEXT,
     DATA,
     SEQUENCE,
     TIMES,
+    Table,
     TablePaths,
+    TableSink,
     by_time,
     context_of,
     record_of,
@@ -91,77 +93,44 @@ def _packer(
     return lambda row: bytes(row[DATA] or b"")
 
 
-def open_sink(path: Path, options: ConversionOptions, losses: Losses) -> "ParquetSink":
+def open_sink(path: Path, options: ConversionOptions, losses: Losses) -> TableSink:
     """Begin a file, or a folder of files."""
-    return ParquetSink(path, options, losses)
+    return TableSink(TablePaths(path, _SUFFIX, options), ArrowTable, losses)
 
 
-class ParquetSink(RecordSink):
-    """Writes tables."""
-
-    def __init__(self, path: Path, options: ConversionOptions, losses: Losses) -> None:
-        super().__init__(losses)
-        self._paths = TablePaths(path, _SUFFIX, options)
-        self._tables: dict[str, _ArrowTable | str] = {}
-
-    def put(self, record: ConvertedRecord) -> bool:
-        if record.topic not in self._tables:
-            path = self._paths.find(record)
-            self._tables[record.topic] = path if isinstance(path, str) else _ArrowTable(path, record.cls)
-        table = self._tables[record.topic]
-        if isinstance(table, str):
-            return self.lose(table)
-        problem = table.write(record)
-        return self.lose(problem) if problem else True
-
-    def finish(self) -> None:
-        for each in self._tables.values():
-            if isinstance(each, _ArrowTable):
-                each.flush()
-
-    def close(self) -> None:
-        for each in self._tables.values():
-            if isinstance(each, _ArrowTable):
-                each.writer.close()
-
-
-class _ArrowTable:
+class ArrowTable(Table):
     """The file of one topic, and the rows that are not written yet."""
 
     def __init__(self, path: Path, cls: type[Message] | None) -> None:
+        super().__init__(cls)
         shape = None if cls is None else layout(cls)
         self._fields = [] if shape is None else [each for each in shape.fields if _has_columns(each.shape)]
         own = [(DATA, pa.binary())] if cls is None else [(each.wire_name, _type(each.shape)) for each in self._fields]
         self._schema = pa.schema([*_CONTEXT, *own], metadata=_metadata(cls))
-        self.writer = pq.ParquetWriter(path, self._schema)
-        self._cls = cls
+        self._writer = pq.ParquetWriter(path, self._schema)
         self._columns: list[list[Any]] = [[] for _ in self._schema]
 
-    def write(self, record: ConvertedRecord) -> str:
-        """Add a row; return in words what is lost if it has no place here, and else nothing."""
-        if record.cls is not self._cls:
-            return f"messages of {record.topic} of another type than the first"
-        data, context = record.sample.data, context_of(record)
+    def add(self, record: ConvertedRecord, message: Message | None) -> str:
+        context = context_of(record)
         if any(each is not None and each > _LATEST for each in context[: len(TIMES)]):
             return f"messages of {record.topic} from after the year 2262"
-        try:
-            message = None if self._cls is None else self._cls.decode(data)
-        except DecodeError:
-            return f"messages of {record.topic} of another type than {record.type_name}"
-        values = (
-            [data] if message is None else [_value(each.shape, getattr(message, each.name)) for each in self._fields]
-        )
+        values = [_value(each.shape, getattr(message, each.name)) for each in self._fields]
+        if message is None:
+            values = [record.sample.data]
         for column, value in zip(self._columns, [*context, *values], strict=True):
             column.append(value)
         if len(self._columns[0]) >= _ROWS:
-            self.flush()
+            self.finish()
         return ""
 
-    def flush(self) -> None:
+    def finish(self) -> None:
         """Write the rows so far as a group."""
         arrays = [pa.array(column, each.type) for column, each in zip(self._columns, self._schema, strict=True)]
-        self.writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+        self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
         self._columns = [[] for _ in self._schema]
+
+    def close(self) -> None:
+        self._writer.close()
 
 
 def _metadata(cls: type[Message] | None) -> dict[bytes, bytes]:

@@ -1,15 +1,16 @@
 """What tables of messages have in common: columns about each message, and a file for each topic."""
 
+import abc
 import heapq
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from r2p.codecs import PublisherClass
-from r2p.errors import BagError, InvalidName
+from r2p.errors import BagError, DecodeError, InvalidName
 from r2p.messages import Message
 from r2p.names import topic_name
-from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord
+from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
 from r2p.recording.format import OWN_PREFIX
 from r2p.runtime.sample import Sample, Source
 
@@ -130,3 +131,59 @@ def _is_file_name(part: str) -> bool:
         and "\\" not in part
         and len(part.encode(errors="replace")) <= _FILE_NAME_MAX
     )
+
+
+class Table(abc.ABC):
+    """The table of one topic while it is written, with the columns of one type."""
+
+    def __init__(self, cls: type[Message] | None) -> None:
+        self._cls = cls
+
+    def write(self, record: ConvertedRecord) -> str:
+        """Write a row; return in words what is lost if it has no place here, and else nothing."""
+        if record.cls is not self._cls:
+            return f"messages of {record.topic} of another type than the first"
+        try:
+            return self.add(record, None if self._cls is None else self._cls.decode(record.sample.data))
+        except DecodeError:
+            return f"messages of {record.topic} of another type than {record.type_name}"
+
+    @abc.abstractmethod
+    def add(self, record: ConvertedRecord, message: Message | None) -> str:
+        """Do what `write` does, with the message of the record; None if its type is unknown."""
+
+    def finish(self) -> None:
+        """Write what is left."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Close the file."""
+
+
+class TableSink(RecordSink):
+    """Writes a table for each topic; `begin` begins one."""
+
+    def __init__(self, paths: TablePaths, begin: Callable[[Path, type[Message] | None], Table], losses: Losses) -> None:
+        super().__init__(losses)
+        self._paths = paths
+        self._begin = begin
+        self._tables: dict[str, Table | str] = {}
+
+    def put(self, record: ConvertedRecord) -> bool:
+        if record.topic not in self._tables:
+            path = self._paths.find(record)
+            self._tables[record.topic] = path if isinstance(path, str) else self._begin(path, record.cls)
+        table = self._tables[record.topic]
+        problem = table if isinstance(table, str) else table.write(record)
+        return self.lose(problem) if problem else True
+
+    def finish(self) -> None:
+        for each in self._written():
+            each.finish()
+
+    def close(self) -> None:
+        for each in self._written():
+            each.close()
+
+    def _written(self) -> list[Table]:
+        return [each for each in self._tables.values() if isinstance(each, Table)]
