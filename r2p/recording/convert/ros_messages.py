@@ -1,12 +1,16 @@
-"""Messages of ROS as they are in recordings: their types, and their bytes as those that r2p packs."""
+"""Messages of ROS as they are in recordings: their types, their bytes as those that r2p packs, and how to read them."""
 
 import functools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import msgspec
 
+from r2p.errors import DecodeError, InvalidName, MessageError
 from r2p.messages import Message, layout
+from r2p.names import topic_name
+from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses
 from r2p.recording.types import schema_of
 from r2p.ros.classes import definitions_of, standard_classes
 from r2p.ros.definitions import definition_text
@@ -16,6 +20,7 @@ from r2p.ros.stamps import StampSource
 from r2p.ros.topics import ros_class
 from r2p.ros.transcoding import transcoder
 from r2p.ros.type_names import ros2_name, short_name
+from r2p.runtime.sample import Sample, Source
 
 
 class RosDecoder(msgspec.Struct, frozen=True):
@@ -85,3 +90,43 @@ def ros_schema(cls: type[Message], version: int) -> RosSchema:
     of_ros = name.partition("/")[0] in OF_ROS
     found = definitions_of_ros(name, 1) if of_ros else definitions_with_those_of_ros(cls, 1)
     return RosSchema(ros2_name(name), definition_text(name, found), ros1_md5(cls))  # rosbags has such names
+
+
+def records_of(reader: Any, version: int, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedRecord]:
+    """Iterate over the messages of an open reader of rosbags, as far as the options ask for them.
+
+    A publisher is the node of ROS that its connection names; only those of ROS 1 do.
+    """
+    channels = {each.id: _channel(each, version, options) for each in reader.connections}
+    chosen = [each for each in reader.connections if channels[each.id] is not None]
+    for connection, time, data in reader.messages(chosen, options.start, options.end) if chosen else ():
+        channel = channels[connection.id]
+        if isinstance(channel, str):
+            losses[channel] += 1
+        elif channel is not None:
+            yield from _record(*channel, time, bytes(data), losses)
+
+
+def _channel(connection: Any, version: int, options: ConversionOptions) -> tuple[str, Source, RosDecoder] | str | None:
+    """Return topic, publisher and decoder of a connection; in words what is lost of it; None for what is left out."""
+    name, definition = connection.topic, connection.msgdef
+    try:
+        topic = topic_name(name)
+        if not options.wants(topic):
+            return None
+        decoder = ros_decoder(connection.msgtype, version, definition.data if definition.format.name == "MSG" else "")
+    except (InvalidName, MessageError) as error:
+        return f"messages of {name}: {error}"
+    *module, node = (getattr(connection.ext, "callerid", None) or "").strip("/").split("/")
+    return topic, Source("_".join(module), node), decoder
+
+
+def _record(
+    topic: str, source: Source, decoder: RosDecoder, time: int, data: bytes, losses: Losses
+) -> Iterator[ConvertedRecord]:
+    try:
+        packed, stamp = decoder(data)
+    except DecodeError:
+        losses[f"messages of {topic} that can't be decoded"] += 1
+        return
+    yield ConvertedRecord(topic, time, Sample(packed, source, stamp or time, stamped=stamp > 0), decoder.cls)

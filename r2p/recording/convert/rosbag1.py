@@ -6,55 +6,21 @@ from typing import Any
 
 from rosbags.rosbag1 import Reader, ReaderError, Writer
 
-from r2p.errors import BagError, DecodeError, InvalidName, MessageError
-from r2p.names import topic_name
-from r2p.recording.convert.ros_messages import RosDecoder, ros_decoder, ros_schema
+from r2p.errors import BagError, MessageError
+from r2p.recording.convert.ros_messages import records_of, ros_schema
 from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
-from r2p.runtime.sample import Sample, Source
 from r2p.units import SECOND
 
-_LATEST = 1 << 32  # seconds since 1970 that a time of ROS 1 can't have any more
+_LATEST = 1 << 32  # seconds since 1970, from which on ROS 1 has no times
 
 
 def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedRecord]:
     """Iterate over the messages. A publisher is the node of ROS that its connection names."""
     try:
         with Reader(path) as reader:
-            channels = {each.id: _channel(each, options) for each in reader.connections}
-            chosen = [each for each in reader.connections if channels[each.id] is not None]
-            for connection, time, data in reader.messages(chosen, options.start, options.end) if chosen else ():
-                found = channels[connection.id]
-                if isinstance(found, str):
-                    losses[found] += 1
-                elif found is not None:
-                    yield from _record(*found, time, data, losses)
+            yield from records_of(reader, 1, options, losses)
     except (ReaderError, AssertionError, KeyError, ValueError) as error:
         raise BagError(f"{path} is damaged, or was not finished: {error}; `rosbag reindex` may help") from error
-
-
-def _channel(connection: Any, options: ConversionOptions) -> tuple[str, Source, RosDecoder] | str | None:
-    """Return topic, publisher and decoder of a connection; in words what is lost of it; None for what is left out."""
-    name = connection.topic
-    try:
-        topic = topic_name(name)
-        if not options.wants(topic):
-            return None
-        decoder = ros_decoder(connection.msgtype, 1, connection.msgdef.data)
-    except (InvalidName, MessageError) as error:
-        return f"messages of {name}: {error}"
-    *module, node = (connection.ext.callerid or "").strip("/").split("/")
-    return topic, Source("_".join(module), node), decoder
-
-
-def _record(
-    topic: str, source: Source, decoder: RosDecoder, time: int, data: bytes, losses: Losses
-) -> Iterator[ConvertedRecord]:
-    try:
-        packed, stamp = decoder(data)
-    except DecodeError:
-        losses[f"messages of {topic} that can't be decoded"] += 1
-        return
-    yield ConvertedRecord(topic, time, Sample(packed, source, stamp or time, stamped=stamp > 0), decoder.cls)
 
 
 def open_sink(path: Path, options: ConversionOptions, losses: Losses) -> "Rosbag1Sink":

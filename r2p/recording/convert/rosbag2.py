@@ -12,22 +12,20 @@ from typing import Any
 import yaml
 from mcap.reader import make_reader
 from mcap.summary import Summary
-from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 
-from r2p.errors import BagError, DecodeError, InvalidName, MessageError
+from r2p.errors import BagError, DecodeError, MessageError
 from r2p.messages import Message
-from r2p.names import topic_name
 from r2p.recording.bag_file import Attachment
 from r2p.recording.convert import mcap_files
-from r2p.recording.convert.ros_messages import RosDecoder, ros_decoder, ros_schema
+from r2p.recording.convert.ros_messages import records_of, ros_schema
 from r2p.recording.convert.stream import ConversionOptions, ConvertedItem, ConvertedRecord, Losses, RecordSink
 from r2p.recording.entries import MetadataEntry
 from r2p.recording.messages import SampleMeta
 from r2p.recording.types import schema_of
 from r2p.ros.library import ros2_hash
 from r2p.ros.transcoding import transcoder
-from r2p.runtime.sample import Sample, Source
+from r2p.runtime.sample import Sample
 
 _METADATA = "metadata.yaml"
 _VERSION = 8
@@ -40,7 +38,8 @@ def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[Con
         if files:
             yield from mcap_files.read_files(files, options, losses)
         else:
-            yield from _by_rosbags(path, options, losses)
+            with Reader(path) as reader:
+                yield from records_of(reader, 2, options, losses)
     except (ReaderError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise BagError(f"{path} is damaged, or was not finished: {error}; `ros2 bag reindex` may help") from error
 
@@ -59,40 +58,6 @@ def _plain_files(path: Path) -> list[Path]:
             return [path / Path(str(name)).name for name in names]
         case _:
             return []
-
-
-def _by_rosbags(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedRecord]:
-    with Reader(path) as reader:
-        channels = {each.id: _channel(each, options) for each in reader.connections}
-        chosen = [each for each in reader.connections if channels[each.id] is not None]
-        for connection, time, data in reader.messages(chosen, options.start, options.end) if chosen else ():
-            found = channels[connection.id]
-            if isinstance(found, str):
-                losses[found] += 1
-            elif found is not None:
-                yield from _record(*found, time, data, losses)
-
-
-def _channel(connection: Any, options: ConversionOptions) -> tuple[str, RosDecoder] | str | None:
-    """Return topic and decoder of a connection; in words what is lost of it; None for what is left out."""
-    name = connection.topic
-    has_text = connection.msgdef.format == MessageDefinitionFormat.MSG
-    try:
-        topic = topic_name(name)
-        if not options.wants(topic):
-            return None
-        return topic, ros_decoder(connection.msgtype, 2, connection.msgdef.data if has_text else "")
-    except (InvalidName, MessageError) as error:
-        return f"messages of {name}: {error}"
-
-
-def _record(topic: str, decoder: RosDecoder, time: int, data: bytes, losses: Losses) -> Iterator[ConvertedRecord]:
-    try:
-        packed, stamp = decoder(bytes(data))
-    except DecodeError:
-        losses[f"messages of {topic} that can't be decoded"] += 1
-        return
-    yield ConvertedRecord(topic, time, Sample(packed, Source(), stamp or time, stamped=stamp > 0), decoder.cls)
 
 
 def open_sink(path: Path, options: ConversionOptions, losses: Losses) -> "Rosbag2Sink":
