@@ -17,7 +17,7 @@ from r2p.messages import Message
 from r2p.recording.bag_file import Attachment, BagFile, Paths, bag_paths
 from r2p.recording.channels import BagChannel, M
 from r2p.recording.format import CDR, LATCHED, METADATA, ChannelInfo
-from r2p.recording.mcap_reader import TIME_MAX, ChunkRef, RawMessage
+from r2p.recording.mcap_reader import TIME_MAX, ChunkRef, MessageRecord
 from r2p.recording.messages import SampleMeta
 from r2p.recording.samples import sample_of
 from r2p.ros.cdr import cdr
@@ -55,7 +55,7 @@ class RecordedMessage(msgspec.Struct, Generic[C], frozen=True, gc=False):
     message: C
 
 
-class RawRecord(msgspec.Struct, frozen=True, gc=False):
+class RawMessage(msgspec.Struct, frozen=True, gc=False):
     """A message of any channel as it is in the file; times in ns (UTC)."""
 
     channel: BagChannel
@@ -90,7 +90,7 @@ class Bag:
         """
         self.paths = bag_paths(path)
         self.files: list[BagFile] = []
-        """The files of the recording, for those who copy their chunks."""
+        """The files of the recording, with their chunks."""
         try:
             for each in self.paths:
                 self.files.append(BagFile(each))
@@ -308,10 +308,10 @@ class Bag:
         *,
         start: int | None = None,
         end: int | None = None,
-    ) -> Iterator[RawRecord]:
+    ) -> Iterator[RawMessage]:
         """Iterate over the messages of all channels, or of those wanted, as they are in the file."""
         for number, (log_time, channel_id, sequence, publish_time, data) in self._messages(wanted, start, end):
-            yield RawRecord(self.files[number].channels[channel_id], log_time, publish_time, sequence, data)
+            yield RawMessage(self.files[number].channels[channel_id], log_time, publish_time, sequence, data)
 
     def last_before(self, time: int, topics: Collection[str] | None = None) -> list[RecordedSample]:
         """Return the last sample of each channel before `time` (UTC, ns), if it has one: what a late subscriber gets.
@@ -343,14 +343,14 @@ class Bag:
 
     def _messages(
         self, wanted: Callable[[BagChannel], bool] | None, start: int | None, end: int | None
-    ) -> Iterator[tuple[int, RawMessage]]:
+    ) -> Iterator[tuple[int, MessageRecord]]:
         """Yield messages in the order of their log times, each with the number of its file.
 
         Those with the same time stay in the order of the file. A chunk is read when its turn comes.
         """
         first, last = 0 if start is None else start, TIME_MAX + 1 if end is None else end
         chunks = self._chunks(wanted, first, last)
-        held: list[tuple[int, int, RawMessage]] = []
+        held: list[tuple[int, int, MessageRecord]] = []
         size = 0
         for i, (chunk, number, ids) in enumerate(chunks):
             found = self._read(number, chunk, ids, first, last)
@@ -364,7 +364,9 @@ class Bag:
             del held[:ready]
             size = size if held else 0
 
-    def _read(self, number: int, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int) -> list[RawMessage]:
+    def _read(
+        self, number: int, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int
+    ) -> list[MessageRecord]:
         """Return the messages of a chunk; none if it can't be read, which is counted."""
         try:
             return self.files[number].messages(chunk, ids, start, end)

@@ -14,7 +14,7 @@ from mcap.records import Metadata as MetadataRecord
 from r2p.errors import BagError
 from r2p.recording.channels import BagChannel, channels_of
 from r2p.recording.format import FORMAT, METADATA, RECORD_HEAD
-from r2p.recording.mcap_reader import TIME_MAX, ChunkRef, McapReader, RawMessage, messages, parse
+from r2p.recording.mcap_reader import TIME_MAX, ChunkRef, McapReader, MessageRecord, messages, parse
 from r2p.recording.summary import Summary, read_summary
 
 SUFFIX = ".mcap"
@@ -83,7 +83,7 @@ class BagFile:
                 continue
             yield Attachment(record.name, record.media_type, record.data, record.log_time)
 
-    def messages(self, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int) -> list[RawMessage]:
+    def messages(self, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int) -> list[MessageRecord]:
         """Return the messages of a chunk in the order of their log times: of channels that are known, and wanted.
 
         Raises BagError if the chunk can't be read.

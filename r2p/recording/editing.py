@@ -19,7 +19,7 @@ from mcap.records import Chunk
 from msgspec.structs import replace
 
 from r2p.errors import BagError, DecodeError, MessageError
-from r2p.recording.bag import Bag, RawRecord
+from r2p.recording.bag import Bag, RawMessage
 from r2p.recording.bag_file import BagFile
 from r2p.recording.channels import BagChannel
 from r2p.recording.format import LATCHED, METADATA, OWN_PREFIX
@@ -222,7 +222,7 @@ def merge(
         yield done
 
 
-def _shifted(number: int, bag: Bag, offset: int, wanted: Wanted | None) -> Iterator[tuple[int, RawRecord]]:
+def _shifted(number: int, bag: Bag, offset: int, wanted: Wanted | None) -> Iterator[tuple[int, RawMessage]]:
     """Yield the messages of a bag, with the number of the bag, at their times in the new file."""
     for record in bag.raw(wanted):
         if not offset:
@@ -230,7 +230,7 @@ def _shifted(number: int, bag: Bag, offset: int, wanted: Wanted | None) -> Itera
             continue
         data = _shifted_companion(record.data, offset) if record.channel.kind == "meta" else record.data
         log_time, publish_time = _moved(record.log_time, offset), _moved(record.publish_time, offset)
-        yield number, RawRecord(record.channel, log_time, publish_time, record.sequence, data)
+        yield number, RawMessage(record.channel, log_time, publish_time, record.sequence, data)
 
 
 def _moved(time: int, offset: int) -> int:

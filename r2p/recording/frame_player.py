@@ -57,7 +57,7 @@ class FramePlayer:
         end: int | None = None,
         anyway: bool = False,
     ) -> None:
-        """Raises BagError if the bag has no frames of this bus, and TransportError for a URL that has no CAN bus."""
+        """Choose the bus. Raises BagError if the bag has no frames of it, TransportError for a URL without CAN bus."""
         reader = BusReader(bag)
         self.bus = reader.bus(bus)
         """The bus of the recording that is played."""

@@ -75,7 +75,7 @@ class FrameRecorder:
     def __init__(
         self, via: str | SimCan, put: Put, *, name: str = "", report: Callable[[str], object] | None = None
     ) -> None:
-        """Raises TransportError for a URL that can't be that of a CAN bus."""
+        """Choose the bus. Raises TransportError for a URL that can't be that of a CAN bus."""
         self.frames = 0
         """The frames that were handed on."""
         self.lost: Counter[str] = Counter()

@@ -43,7 +43,7 @@ _OTHERS: Final = {
     b"\x04\x22\x4d\x18": "is compressed: unlz4 FILE makes it readable",
 }
 
-RawMessage = tuple[int, int, int, int, bytes]
+MessageRecord = tuple[int, int, int, int, bytes]
 """Log time, id of the channel, sequence, publish time, data."""
 
 
@@ -240,12 +240,12 @@ def _in_steps(read: Callable[[int], bytes], size: int) -> bytes:
     return bytes(data)
 
 
-def messages(data: bytes, wanted: "Container[int] | None", start: int, end: int) -> list[RawMessage]:
+def messages(data: bytes, wanted: "Container[int] | None", start: int, end: int) -> list[MessageRecord]:
     """Return the messages among the records of a chunk: of these channels, with a log time from `start` to `end`.
 
     What follows a record that is cut is left out.
     """
-    found: list[RawMessage] = []
+    found: list[MessageRecord] = []
     unpack, add, at, size = MESSAGE_RECORD.unpack_from, found.append, 0, len(data)
     while at + MESSAGE_RECORD.size <= size:
         opcode, length, channel, sequence, log_time, publish_time = unpack(data, at)

@@ -200,10 +200,6 @@ class McapWriter:
         """Whether there is a chunk."""
         return bool(self._counts)
 
-    def flush(self) -> None:
-        """Hand all bytes to the operating system."""
-        self._file.flush()
-
     def finish(self) -> None:
         """Write the summary and the end of the file, and leave it open."""
         end = packed(DataEnd(self._crc))

@@ -57,7 +57,7 @@ class TopicSelection:
     """The topics to record: names and patterns as in a shell (`camera/*`), None for all, without those excluded."""
 
     def __init__(self, topics: Iterable[str] | None = None, exclude: Iterable[str] = ()) -> None:
-        """Raises InvalidName or NameTooLong for a name that no topic can have."""
+        """Choose topics. Raises InvalidName or NameTooLong for a name that no topic can have."""
         given = ["*"] if topics is None else [each.removeprefix("/") for each in _names(topics)]
         self._excluded = [each.removeprefix("/") for each in _names(exclude)]
         self._patterns = [each for each in given if _is_pattern(each)]
@@ -310,7 +310,7 @@ class Recorder:
             self._entries.clear()
 
     def _put_latched(self) -> None:
-        """Write which topics are latched, when there are more than before: who plays them latches them, too."""
+        """Write which topics are latched, when there are more than before: to be played as such."""
         unknown = [name for name in self._topics if name not in self._latched]
         if found := [name for name in unknown if self._is_latched(name)]:
             self._latched.update(found)

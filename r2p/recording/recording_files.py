@@ -85,7 +85,7 @@ class BackgroundSync:
         self._thread.start()
 
     def join(self) -> None:
-        """Wait until the file is not used any more, and raise the OSError of the last time."""
+        """Wait until the file is no longer used, and raise the OSError of the last time."""
         if self._thread is not None:
             self._thread.join()
         self._thread = None

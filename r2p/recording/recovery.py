@@ -22,7 +22,7 @@ from r2p.recording.format import MAGIC, MESSAGE, META_PREFIX, RECORD_HEAD
 from r2p.recording.mcap_reader import (
     CHUNK_MAX,
     McapReader,
-    RawMessage,
+    MessageRecord,
     messages,
     other_records,
     parse,
@@ -46,7 +46,7 @@ class RecoveryReport(msgspec.Struct):
     """What was found in a file. `start` and `end` are the log times of its messages (UTC, ns; 0 without messages).
 
     Companions of messages are not counted. `unreadable`: bytes that belong to nothing whole; `damaged`: chunks and
-    records whose checksum or content is wrong; `without_channel`: messages whose channel is not in the file any more.
+    records whose checksum or content is wrong; `without_channel`: messages whose channel is missing in the file.
     `complete`: nothing is missing, so the file needs no recovery.
     """
 
@@ -267,7 +267,7 @@ class RecordingRecovery:
         for message in messages(data, None, 0, _ALL_TIMES):
             self._message(message)
 
-    def _message(self, message: RawMessage) -> None:
+    def _message(self, message: MessageRecord) -> None:
         log_time, channel, sequence, publish_time, data = message
         report = self.report
         if channel not in self._writer.channels:

@@ -54,9 +54,6 @@ KINDS: Final = {
 }
 """The kinds of happenings, and what they are."""
 
-MISSES: Final = frozenset({"missed", "late", "overdue", "lost", "degraded"})
-"""The kinds that concern messages."""
-
 _KIND_OF_EVENT = {"no answer": "module", "answers": "module", "no master": "master", "events lost": "recorder"}
 _BASELINE = 11 * SECOND  # tables of slots are repeated every ten seconds
 _TOGETHER = SECOND  # ns in which the same happenings are joined

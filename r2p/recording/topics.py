@@ -33,7 +33,7 @@ HELD_BYTES = 16 << 20
 """Bytes of the messages of one publisher that wait for their type, at most."""
 
 PUBLISHERS_MAX = 1024
-"""Publishers of one topic that are told apart; those that come after them are recorded without their names."""
+"""Publishers of one topic that are recorded under their names; those that come after them have none."""
 
 _ASKED_AGAIN = 10 * SECOND  # ns after a question for a type that found none
 _UNANNOUNCED: Mapping[str, type[Message]] = {LOG: Log}

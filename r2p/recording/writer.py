@@ -164,12 +164,6 @@ class BagWriter:
         index = b"".join(message_index(channel, _pairs(index)) for channel, index in indexes.items())
         self._append(PackedChunk.make(chunk, index))
 
-    def flush(self) -> None:
-        """End the chunk, and hand all bytes to the operating system."""
-        self.end_chunk()
-        if self._file is not None:
-            self._file.flush()
-
     def finish(self) -> None:
         """Write the summary and the end of the file, and leave it open."""
         self.end_chunk()

@@ -198,7 +198,7 @@ class _CopySource:
             self._run.append(_CopiedBlock(0))
 
     def _add_seq(self, shape: Shape) -> None:
-        """Add the field that ROS 2 does not have any more."""
+        """Add the field that ROS 2 no longer has."""
         if shape.kind != "u32":
             raise MessageError(f"the seq of {_STAMPED} is {shape.kind} here, but u32 everywhere else")
         self._end_run()
@@ -366,7 +366,7 @@ def _structs(place: int, run: list[_CopiedBlock], *, is_counted: bool) -> tuple[
 
 
 def _is_seq(shape: Layout[Any], field: str) -> bool:
-    """Return whether a field is one that ROS 2 does not have any more."""
+    """Return whether a field is one that ROS 2 no longer has."""
     return shape.name == _STAMPED and field == "seq"
 
 

@@ -50,7 +50,7 @@ def write(
         if finish:
             writer.finish()
         else:
-            writer.flush()
+            writer.end_chunk()
     return path
 
 

@@ -36,7 +36,7 @@ def test_any_messages_are_read_by_a_strict_reader(
                 writer.attach(f"{channel}", "text/plain", b"x" * channel, number)
             writer.add(channels[channel], *rest)  # type: ignore[arg-type]
             if number in flushes:
-                writer.flush()
+                writer.end_chunk()
         writer.finish()
     found = [(m.channel_id, m.log_time, m.publish_time, m.sequence, m.data) for m in check(path)]
     assert found == [(channels[channel], *rest) for channel, *rest in messages]

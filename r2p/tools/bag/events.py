@@ -78,12 +78,14 @@ def _chosen(only: list[str]) -> set[str]:
 
 def _summarise(bag: "Bag", counts: dict[str, int], first: int | None, last: int | None) -> None:
     """Report the sums of misses; without anything, why there may be nothing."""
+    from r2p.recording.messages import EVENTS
+
     when = f"from {shown(first or bag.start)} to {shown(last or bag.end, date=False)}"
     misses = ", ".join(f"{counts[kind]} {kind}" for kind in _KINDS if kind in counts and kind in _GROUPS["misses"])
     if misses:
         notify(f"{when}: {misses}")
     elif not counts:
-        observed = any(each.name.startswith("/r2p/events") for each in bag.channels)
+        observed = any(each.name == EVENTS for each in bag.channels)
         why = "" if observed else ": this recording has only messages, made with --no-events, or by another program"
         notify(f"nothing {when}{why}")
 

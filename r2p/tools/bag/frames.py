@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from r2p.bus import FrameKind, SeenFrame
+from r2p.tools.bag.files import File, opened
 from r2p.tools.bag.times import End, Start, span
 from r2p.tools.bus.slots import Svg, show
 from r2p.tools.bus.traffic import Kinds, OnlyTopics, frame_line, frame_record, load_record, load_text, trouble
@@ -23,7 +24,7 @@ Window = tuple[int | None, int | None]
 
 
 async def frames(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording, a directory of its parts, or a pattern.")],
+    file: File,
     *,
     bus: Annotated[
         str | None, typer.Option("--bus", metavar="NAME", help="This bus, where the recording has several.")
@@ -44,12 +45,11 @@ async def frames(
     A line has time, slot, kind, topic, module, laxity, fragment and data, as in `r2p bus dump`; the time is in seconds
     from the start of the recording.
     """
-    from r2p.recording.bag import Bag  # only here, as they take a while
-    from r2p.recording.frame_reader import BusReader
+    from r2p.recording.frame_reader import BusReader  # only here, as it takes a while
 
     _check(load=load, slots=slots, filtered=bool(kind or topic), svg=svg, period=period)
     output = Output(format)
-    with Bag(file) as bag:
+    with opened(file) as bag:
         reader = BusReader(bag)
         name = reader.bus(bus).name
         window = span((bag.start, bag.end), start, end)

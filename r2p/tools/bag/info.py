@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from r2p.recording.bag import Bag
     from r2p.recording.channels import BagChannel
 
-_RECORDER = "/r2p/recorder"  # whose messages say what was lost
 _CHUNKS_AT_ONCE = 200  # with messages about losses, which are read without --all: some ten milliseconds
 _TOPIC_COLUMNS = ["topic", "type", "count", "rate", "publishers", "class", "link"]
 _CHANNEL_COLUMNS = ["channel", "type", "count"]
@@ -82,6 +81,8 @@ def _record(bag: "Bag", *, count_all: bool) -> dict[str, Any]:
 
 def _head(record: dict[str, Any]) -> Iterable[str]:
     """Yield the lines above the tables."""
+    from r2p.recording.messages import LOSSES
+
     files = record["files"]
     size = sum(each["size"] for each in files)
     more = f" and {len(files) - 1} more files" if len(files) > 1 else ""
@@ -98,9 +99,8 @@ def _head(record: dict[str, Any]) -> Iterable[str]:
         yield f"attachments  {', '.join(record['attachments'])}"
     if record["damaged_chunks"]:
         yield f"damaged      {record['damaged_chunks']} chunks, whose messages are not counted"
-    if not (record["losses"] or record["uncounted"]) and any(
-        each["channel"] == _RECORDER for each in record["channels"]
-    ):
+    is_watched = any(each["channel"] == LOSSES for each in record["channels"])
+    if is_watched and not (record["losses"] or record["uncounted"]):
         yield "lost         nothing, by what the recorder knows"
     if record["uncounted"]:
         yield f"not counted  losses in {', '.join(record['uncounted'])}: --all reads these"

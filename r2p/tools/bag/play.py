@@ -185,7 +185,7 @@ class _MessagePlay:
                 await wait_until(lambda: set(self._wait_for) <= set(player.subscribed), math.inf)
         elif not player.subscribed:
             notify(
-                f"no one subscribes to {_named(list(player.topics))} yet: playing anyway; "
+                f"no subscriber of {_named(list(player.topics))} yet: playing anyway; "
                 f"--wait-for {next(iter(player.topics))} waits for a subscriber"
             )
 

@@ -271,16 +271,18 @@ def _parts(settings: Settings, buses: "list[FrameRecorder] | None", *, events: b
 
     The recorders of frames enter `buses`; None: no frames.
     """
-    from r2p.recording.frame_recorder import FrameRecorder  # only here, as it takes a while
+    from r2p.recording.frame_recorder import frames_of  # only here, as it takes a while
     from r2p.recording.observations import Observations
 
     file = find()
     files = {} if file is None else {file.name: ("application/toml", file.read_bytes())}
 
     def of_bus(url: str) -> "Part":
-        def begin(_module: r2p.Module, add: "Callable[[BagEntry], object]") -> FrameRecorder:
+        make = frames_of(url, report=notify)
+
+        def begin(module: r2p.Module, add: "Callable[[BagEntry], object]") -> "FrameRecorder":
             assert buses is not None
-            recorder = FrameRecorder(url, lambda entries: [add(each) for each in entries], report=notify)
+            recorder = make(module, add)
             buses.append(recorder)
             return recorder
 

@@ -74,4 +74,4 @@ def _remarks(report: "RecoveryReport") -> Iterator[str]:
     if report.damaged:
         yield f"{report.damaged} damaged parts are left out"
     if report.without_channel:
-        yield f"{report.without_channel} messages are left out, as it does not say any more of which topic they are"
+        yield f"{report.without_channel} messages are left out, as their channel is missing in the file"

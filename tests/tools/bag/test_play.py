@@ -117,7 +117,7 @@ async def test_it_waits_for_a_subscriber(recorded: Path, capsys: Any) -> None:
 @pytest.mark.virtual_time
 async def test_without_subscribers_it_says_so(recorded: Path, capsys: Any) -> None:
     await play([recorded], via=VIA)
-    assert "no one subscribes to leds, others yet" in capsys.readouterr().err
+    assert "no subscriber of leds, others yet" in capsys.readouterr().err
 
 
 @pytest.mark.virtual_time
