@@ -112,4 +112,5 @@ class ChannelInfo(msgspec.Struct, frozen=True):
         except KeyError:
             raise DecodeError(f"{name!r} is not a class of publishers") from None
         texts = {field: metadata.get(field, "") for field in ("topic", "module", "node", "link", "type", "schema")}
+        texts["topic"] = texts["topic"].lstrip("/")  # a name is not another one with a slash before it
         return cls(publisher_class=publisher_class, numbered=metadata.get("numbered") == "yes", **texts)

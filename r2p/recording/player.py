@@ -12,10 +12,20 @@ from typing import Final, Self
 import msgspec
 
 from r2p.clock import Ticker
-from r2p.errors import BagError, InvalidName, TypeMismatch
+from r2p.errors import BagError, InvalidName, NameTooLong, TypeMismatch
 from r2p.messages import SIZE_MAX, ClockOffset, Message, Timestamp, layout
 from r2p.modules.module import Module
-from r2p.names import BUS_LOAD, BUS_SLOTS, LOADER_PREFIX, LOG, NODE_MAX, RESERVED, SERVICE_SUFFIXES, topic_name
+from r2p.names import (
+    BUS_LOAD,
+    BUS_SLOTS,
+    LOADER_PREFIX,
+    LOG,
+    NODE_MAX,
+    RESERVED,
+    SERVICE_SUFFIXES,
+    node_name,
+    topic_name,
+)
 from r2p.protocols.discovery.events import TopicType
 from r2p.recording.bag import Bag, RecordedSample
 from r2p.recording.channels import BagChannel
@@ -32,6 +42,7 @@ DEFAULT_NODE: Final = "play"
 
 _PERIODS_OF: Final = 16  # messages of a periodic topic by which its period is found
 _SURVEYED: Final = 10_000  # messages that are read before for their sizes and periods
+_FAR: Final = 1 << 62  # ns since 1970, in the year 2116; stamps and deadlines beyond it are damage
 _OVERHEAD: Final = 200  # bytes of a sample besides its own
 
 Publication = tuple[str, str, str, PublisherClass]
@@ -154,7 +165,11 @@ class Player:
             raise BagError(
                 f"nothing to play: no message of the recording, of {seconds:.1f} s, is from `start` to `end`"
             )
-        return [each for each in wanted if self._has_type(each)]
+        found = [each for each in wanted if self._has_type(each)]
+        if not found:
+            topic, why = next(iter(self.left_out.items()))
+            raise BagError(f"nothing to play: of {topic}, {why}")
+        return found
 
     def _nothing(self) -> str:
         topics = list(self._bag.topics)
@@ -168,7 +183,13 @@ class Player:
         """Enter the topic of a channel; return False if it can't be played."""
         assert channel.info is not None
         recorded = channel.info.topic
-        name = topic_name(self._options.remap.get(recorded, recorded))
+        try:
+            name = self._name(recorded)
+        except (InvalidName, NameTooLong) as error:
+            if recorded in self._options.remap:
+                raise
+            self.left_out[recorded] = str(error)
+            return False
         if channel.encoding == "cdr" and channel.cls is None:
             self.left_out[recorded] = channel.problem
             return False
@@ -185,6 +206,13 @@ class Player:
         messages = channel.count + (known.messages if known is not None else 0)
         self.topics[name] = PlayedTopic(name, recorded, cls or (known and known.cls) or None, messages)
         return True
+
+    def _name(self, recorded: str) -> str:
+        """Return the name under which a topic is played. Raises InvalidName or NameTooLong."""
+        name = topic_name(self._options.remap.get(recorded, recorded))
+        if name in RESERVED:
+            raise InvalidName(f"topic {name} has messages of r2p itself, which can't be played")
+        return name
 
     @property
     def start(self) -> int:
@@ -297,14 +325,18 @@ class Player:
         """Return a sample as it is published now; `time` is when it was recorded (UTC, ns)."""
         now = self.pacer.utc(time)
         stamp = old.stamp if self._options.clock else now + round((old.stamp - time) / self.pacer.rate)
+        if abs(stamp) > _FAR:  # in a damaged recording
+            stamp = now
         shift = stamp - old.stamp
         span = old.deadline - old.stamp if old.deadline else 0
-        moved = old.clock if old.clock is None or not shift else _moved(old.clock, shift)
+        if abs(span) > _FAR:
+            span = 0
+        moved = old.clock and _moved(old.clock, shift)
         return Sample(
             old.data,
             publisher.source,
             stamp,
-            stamp + span if old.deadline else 0,
+            stamp + span if span else 0,
             publisher.sent,
             old.publisher_class,
             None,
@@ -312,7 +344,7 @@ class Player:
             old.drop_late,
             0,
             moved,
-            now + span if old.deadline else 0,
+            now + span if span else 0,
         )
 
     # Topics and nodes
@@ -344,7 +376,7 @@ class Player:
         key = _publication(info)
         if key in self._publishers:
             return
-        name = self._options.remap.get(info.topic, info.topic)
+        name = self._name(info.topic)
         cls = self.topics[name].cls
         try:
             topic = self._space.open(name, None if cls is None else layout(cls))
@@ -399,9 +431,17 @@ def _publication(info: ChannelInfo | None) -> Publication:
 
 
 def _node_name(info: ChannelInfo) -> str:
-    return info.node or info.module.rpartition("/")[2] or DEFAULT_NODE
+    for name in (info.node, info.module.rpartition("/")[2]):
+        with contextlib.suppress(InvalidName, NameTooLong):  # of another program, or none
+            return node_name(name)
+    return DEFAULT_NODE
 
 
-def _moved(clock: ClockOffset, shift: int) -> ClockOffset:
-    """Return the translation of network time to UTC at another time: what a payload says is then of that time, too."""
-    return msgspec.structs.replace(clock, offset=clock.offset + shift)
+def _moved(clock: ClockOffset, shift: int) -> ClockOffset | None:
+    """Return the translation of network time to UTC at another time: what a payload says is then of that time, too.
+
+    None for one that can't be, in a damaged recording.
+    """
+    offset = clock.offset + shift
+    can_be = abs(offset) <= _FAR and 0 <= clock.epoch < 1 << 32
+    return msgspec.structs.replace(clock, offset=offset) if can_be else None

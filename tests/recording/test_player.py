@@ -13,7 +13,7 @@ from r2p import PublisherClass, Sample, Source
 from r2p.messages import ClockOffset
 from r2p.msg import Led, Odometry, Speed3
 from r2p.recording.bag import Bag
-from r2p.recording.format import LATCHED
+from r2p.recording.format import LATCHED, ChannelInfo
 from r2p.recording.player import Player, PlayOptions
 from r2p.recording.recorder import Recorder
 from r2p.recording.samples import SampleWriter
@@ -319,3 +319,35 @@ async def test_odometry_of_an_own_type_is_known_without_its_class(tmp_path: Path
     path = write(tmp_path / "a.mcap", [("own", sample, Own, T0), ("odometry", sample, Odometry, T0)])
     listener = await played(path, own=Own)
     assert [each.message for each in listener.of("own")] == [Own(2.5)]
+
+
+async def test_what_a_recording_of_strangers_says_is_left_out_or_put_right(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    far = (1 << 63) - 1
+    with path.open("wb") as file:
+        writer = BagWriter(file)
+        for topic in ("/R2P", "//R2P", "/log", "/BOOT_IMU1", "../../evil", "a b", "/leds"):
+            about = ChannelInfo(topic, "../IMU", "a b", SPORADIC)
+            channel = writer.add_channel("/x", "r2p", about.metadata, None)
+            writer.add(channel, T0, far, 1, Led(1, 1).encode())
+        SampleWriter(writer).write("far", Sample(b"", Source(), far, -far, clock=ClockOffset(-1, far, 0)), None, T0)
+        writer.finish()
+    network = Network()
+    async with network.module("play") as module, network.node("PC1") as node:
+        listener = _Listener(node, {"leds": None, "far": None})
+        await asyncio.sleep(1)
+        with Bag(path) as bag, pytest.raises(r2p.InvalidName, match="messages of r2p itself"):
+            Player(module, bag, PlayOptions(remap={"leds": "R2P"}))
+        with Bag(path) as bag:
+            async with Player(module, bag) as player:
+                assert list(player.topics) == ["leds", "far"]
+                assert set(player.left_out) == {"../../evil", "a b"}
+                await asyncio.sleep(1)
+                await player.run()
+        await asyncio.sleep(0.1)
+        assert {each.source.node for each in listener.of("leds")} == {"IMU"}
+        (arrived,) = listener.of("far")
+        assert abs(arrived.stamp - node.now()) < SECOND
+        assert (arrived.deadline, arrived.clock) == (0, None)
+        for task in listener.tasks:
+            task.cancel()
