@@ -29,6 +29,8 @@ logger = logging.getLogger("r2p.bag")
 
 _DEFAULT: Final = SampleMeta()
 _HELD_MAX: Final = 1 << 28  # bytes of messages that wait for their turn, where the chunks of a file overlap
+_HELD_EACH: Final = 200  # bytes of each besides its data
+_COMPANIONS_MAX: Final = 1 << 16  # of one log time
 _TIME = itemgetter(0)
 
 
@@ -69,6 +71,11 @@ def is_of(topics: Collection[str] | None, kinds: Collection[str]) -> Callable[[B
     """Return whether a channel has to do with these topics (None: all), as one of these kinds."""
     names = None if topics is None else {each.removeprefix("/") for each in topics}
     return lambda each: each.info is not None and each.kind in kinds and (names is None or each.info.topic in names)
+
+
+def _memory(messages: list[MessageRecord]) -> int:
+    """Return the bytes of memory of messages."""
+    return _HELD_EACH * len(messages) + sum([len(each[4]) for each in messages])
 
 
 class Bag:
@@ -146,7 +153,7 @@ class Bag:
                 found[channel.key] = channel if known is None else known.plus(channel.count)
         return list(found.values())
 
-    @property
+    @functools.cached_property
     def topics(self) -> dict[str, int]:
         """The topics with samples, and how many they have."""
         counts: dict[str, int] = {}
@@ -263,6 +270,8 @@ class Bag:
             assert info is not None
             try:
                 if channel.kind == "meta":
+                    if len(metas) >= _COMPANIONS_MAX:  # without their messages
+                        metas.clear()
                     metas[info, sequence] = cdr(SampleMeta).decode(data)
                     continue
                 meta = metas.pop((info, sequence), _DEFAULT) if metas else _DEFAULT
@@ -356,13 +365,13 @@ class Bag:
             found = self._read(number, chunk, ids, first, last)
             held += [(each[0], number, each) for each in found]
             held.sort(key=_TIME)
-            size += chunk.size
+            size += _memory(found)
             is_all = i + 1 == len(chunks) or size > _HELD_MAX  # beyond that, order counts less than memory
             ready = len(held) if is_all else bisect_left(held, chunks[i + 1][0].start, key=_TIME)
             for _, file, message in held[:ready]:
                 yield file, message
+            size -= _memory([message for _, _, message in held[:ready]])
             del held[:ready]
-            size = size if held else 0
 
     def _read(
         self, number: int, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int

@@ -84,12 +84,11 @@ class BagFile:
             yield Attachment(record.name, record.media_type, record.data, record.log_time)
 
     def messages(self, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int) -> list[MessageRecord]:
-        """Return the messages of a chunk in the order of their log times: of channels that are known, and wanted.
+        """Return the messages of a chunk: those of the channels `ids`, which the file has; None: of all that it has.
 
         Raises BagError if the chunk can't be read.
         """
-        known = self.channels.keys() if ids is None else ids & self.channels.keys()
-        return messages(self.file.chunk(chunk), known, start, end)
+        return messages(self.file.chunk(chunk), self.channels if ids is None else ids, start, end)
 
     def times(self, chunk: ChunkRef) -> list[tuple[int, int]]:
         """Return the log times in a chunk with their channels; none if it can't be read. The last chunks are kept."""

@@ -28,6 +28,9 @@ R = TypeVar("R")
 CHUNK_MAX: Final = 1 << 28
 """Bytes of messages in one chunk, at most; of a larger one nothing is read."""
 
+MESSAGES_MAX: Final = 1 << 20
+"""Messages in one chunk, at most: a chunk of some kilobytes may unpack to millions without content."""
+
 TIME_MAX: Final = (1 << 64) - 1
 """The last instant that a file can have (UTC, ns)."""
 
@@ -243,8 +246,10 @@ def _in_steps(read: Callable[[int], bytes], size: int) -> bytes:
 def messages(data: bytes, wanted: "Container[int] | None", start: int, end: int) -> list[MessageRecord]:
     """Return the messages among the records of a chunk: of these channels, with a log time from `start` to `end`.
 
-    What follows a record that is cut is left out.
+    What follows a record that is cut is left out. Raises BagError if there are more than MESSAGES_MAX.
     """
+    if len(data) > MESSAGES_MAX * MESSAGE_RECORD.size and _has_too_many(data):
+        raise BagError(f"a chunk has more than {MESSAGES_MAX} messages")
     found: list[MessageRecord] = []
     unpack, add, at, size = MESSAGE_RECORD.unpack_from, found.append, 0, len(data)
     while at + MESSAGE_RECORD.size <= size:
@@ -257,6 +262,15 @@ def messages(data: bytes, wanted: "Container[int] | None", start: int, end: int)
         if start <= log_time < end and (wanted is None or channel in wanted):
             add((log_time, channel, sequence, publish_time, data[begin:at]))
     return found
+
+
+def _has_too_many(data: bytes) -> bool:
+    """Return whether there are more than MESSAGES_MAX records."""
+    count = at = 0
+    while at + RECORD_HEAD.size <= len(data) and count <= MESSAGES_MAX:
+        at += RECORD_HEAD.size + RECORD_HEAD.unpack_from(data, at)[1]
+        count += 1
+    return count > MESSAGES_MAX
 
 
 def other_records(data: bytes) -> list[tuple[int, bytes]]:

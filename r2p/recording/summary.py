@@ -26,6 +26,7 @@ from r2p.recording.mcap_reader import (
 
 _FOOTER: Final = RECORD_HEAD.size + 20 + len(MAGIC)  # bytes of the footer and of the magic behind it
 _SECTION_MAX: Final = 1 << 28  # bytes of a summary
+_DEFINITIONS_MAX: Final = 1 << 28  # bytes of schemas and channels, repeated ones included
 _PIECE: Final = 1 << 20  # bytes of messages outside of chunks that are read together
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 _CHANNEL_OFFSET: Final = 10  # bytes of an id and an offset
@@ -52,9 +53,15 @@ class Summary(msgspec.Struct, eq=False):
     end: int = 0
     problem: str = ""
     damaged: int = 0
+    definitions: int = 0
+    """Bytes of the schemas and channels."""
 
     def add(self, opcode: int, body: bytes) -> None:
         """Enter a schema or a channel; other records are left out. Raises BagError."""
+        if opcode in {Opcode.CHANNEL, Opcode.SCHEMA}:
+            self.definitions += len(body)
+            if self.definitions > _DEFINITIONS_MAX:
+                raise BagError("the schemas and channels are too long")
         if opcode == Opcode.CHANNEL:
             channel = parse(Channel, body)
             self.channels.setdefault(channel.id, channel)

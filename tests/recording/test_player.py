@@ -330,7 +330,9 @@ async def test_what_a_recording_of_strangers_says_is_left_out_or_put_right(tmp_p
             about = ChannelInfo(topic, "../IMU", "a b", SPORADIC)
             channel = writer.add_channel("/x", "r2p", about.metadata, None)
             writer.add(channel, T0, far, 1, Led(1, 1).encode())
-        SampleWriter(writer).write("far", Sample(b"", Source(), far, -far, clock=ClockOffset(-1, far, 0)), None, T0)
+        SampleWriter(writer).write(
+            "far", Sample(Led(1, 1).encode(), Source(), far, -far, clock=ClockOffset(-1, far, 0)), None, T0
+        )
         writer.finish()
     network = Network()
     async with network.module("play") as module, network.node("PC1") as node:

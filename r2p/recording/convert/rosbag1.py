@@ -11,6 +11,8 @@ from r2p.recording.convert.ros_messages import records_of, ros_schema
 from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
 from r2p.units import SECOND
 
+_DAMAGE = ReaderError, AssertionError, LookupError, ValueError, TypeError, EOFError, RuntimeError, MemoryError
+"""What rosbags raises for files that are not as they should be."""
 _LATEST = 1 << 32  # seconds since 1970, from which on ROS 1 has no times
 
 
@@ -19,7 +21,7 @@ def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[Con
     try:
         with Reader(path) as reader:
             yield from records_of(reader, 1, options, losses)
-    except (ReaderError, AssertionError, KeyError, ValueError) as error:
+    except _DAMAGE as error:
         raise BagError(f"{path} is damaged, or was not finished: {error}; `rosbag reindex` may help") from error
 
 

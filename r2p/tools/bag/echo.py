@@ -25,6 +25,7 @@ from r2p.tools.types import Types
 
 if TYPE_CHECKING:
     from r2p.recording.bag import Bag, RecordedMessage, RecordedSample
+    from r2p.recording.channels import BagChannel
 
 Class: TypeAlias = type[r2p.Message]
 
@@ -63,7 +64,8 @@ async def echo(
     with opened(file) as bag:
         names = _names(bag, topics)
         types = Types(settings(None))
-        sources = {each: _EchoedChannel(bag, each, types, type, filter) for each in names}
+        channels = _channels(bag)
+        sources = {each: _EchoedChannel(each, channels[each], types, type, filter) for each in names}
         selection = Selection(names, field or [], meta=meta, form=form_of(output, full=full))
         records = _records(bag, sources, *span((bag.start, bag.end), start, end))
         async with output.while_read():
@@ -115,14 +117,24 @@ def _names(bag: "Bag", given: list[str] | None) -> list[str]:
     return list(names)
 
 
+def _channels(bag: "Bag") -> "dict[str, list[BagChannel]]":
+    """Return the channels by the names of their topics, and by their own."""
+    found: dict[str, list[BagChannel]] = {}
+    for each in bag.channels:
+        for name in {each.name, each.name if each.info is None else each.info.topic}:
+            found.setdefault(name, []).append(each)
+    return found
+
+
 class _EchoedChannel:
     """One topic or channel: the type of its messages, as the user states it or as it was recorded, and their filter."""
 
-    def __init__(self, bag: "Bag", name: str, types: Types, given: str | None, filter: str | None) -> None:
+    def __init__(
+        self, name: str, channels: "list[BagChannel]", types: Types, given: str | None, filter: str | None
+    ) -> None:
         self.name = name
-        self.is_topic = name in bag.topics
+        self.is_topic = any(each.info and each.info.topic == name and each.kind == "samples" for each in channels)
         self._in_hex = 0
-        channels = [each for each in bag.channels if (each.info and each.info.topic == name) or each.name == name]
         recorded = next((each.cls for each in channels if each.kind != "meta" and each.cls), None)
         self._given = types.stated(name, given) if self.is_topic and (given or recorded is None) else None
         for each in channels:

@@ -68,7 +68,7 @@ def _record(bag: "Bag", *, count_all: bool) -> dict[str, Any]:
         "compression": sorted({each.compression or "none" for each in chunks}),
         "packed_bytes": sum(each.length for each in chunks),
         "unpacked_bytes": sum(each.size for each in chunks),
-        "topics": [_topic(bag, name) for name in bag.topics],
+        "topics": _topics(bag),
         "channels": _channels(bag),
         "losses": losses,
         "uncounted": uncounted,
@@ -113,9 +113,21 @@ def _compression(record: dict[str, Any]) -> str:
     return f" ({', '.join(record['compression'])}, {record['packed_bytes'] / unpacked:.0%} of {size_text(unpacked)})"
 
 
-def _topic(bag: "Bag", name: str) -> dict[str, Any]:
-    """Return the row of a topic, with all of its channels."""
-    channels = [each for each in bag.channels if each.kind == "samples" and each.info and each.info.topic == name]
+def _topics(bag: "Bag") -> list[dict[str, Any]]:
+    """Return the rows of all topics."""
+    channels: dict[str, list[BagChannel]] = {name: [] for name in bag.topics}
+    for each in bag.channels:
+        if each.kind == "samples" and each.info:
+            channels[each.info.topic].append(each)
+    ids: list[dict[object, list[int]]] = [{} for _ in bag.files]
+    for file, by_key in zip(bag.files, ids, strict=True):
+        for number, channel in file.channels.items():
+            by_key.setdefault(channel.key, []).append(number)
+    return [_topic(bag, name, of_topic, ids) for name, of_topic in channels.items()]
+
+
+def _topic(bag: "Bag", name: str, channels: "list[BagChannel]", ids: list[dict[object, list[int]]]) -> dict[str, Any]:
+    """Return the row of a topic, with all of its channels; `ids` are those of channels in each file, by their keys."""
     infos = [each.info for each in channels if each.info]
     count = sum(each.count for each in channels)
     publishers = {f"{each.module or '?'}/{each.node}" if each.node else each.module for each in infos}
@@ -123,7 +135,7 @@ def _topic(bag: "Bag", name: str) -> dict[str, Any]:
         "topic": name,
         "type": " ".join(sorted({each.type_name for each in channels if each.type_name})) or None,
         "count": count,
-        "rate": _rate(bag, channels, count),
+        "rate": _rate(bag, channels, ids, count),
         "publishers": sorted(filter(None, publishers)),
         "class": sorted({_class_name(each.publisher_class) for each in infos if each.module or each.node}),
         "link": sorted({each.link for each in infos if each.link}),
@@ -134,19 +146,20 @@ def _class_name(publisher_class: PublisherClass) -> str:
     return CLASS_NAMES[publisher_class]
 
 
-def _rate(bag: "Bag", channels: "list[BagChannel]", count: int) -> float | None:
+def _rate(bag: "Bag", channels: "list[BagChannel]", ids: list[dict[object, list[int]]], count: int) -> float | None:
     """Return the messages per second between the first and the last one of these channels."""
-    keys = {each.key for each in channels}
+    if count < 2:
+        return None
     found = []
-    for file in bag.files:
-        ids = frozenset(number for number, each in file.channels.items() if each.key in keys)
-        chunks = [each for each in file.summary.chunks if each.may_have(ids)]
+    for file, by_key in zip(bag.files, ids, strict=True):
+        own = frozenset(number for each in channels for number in by_key.get(each.key, ()))
+        chunks = [each for each in file.summary.chunks if each.may_have(own)]
         if chunks:
-            found += [(file, min(chunks, key=lambda each: each.start), ids)]
-            found += [(file, max(chunks, key=lambda each: each.end), ids)]
-    times = [time for file, chunk, ids in found for time, channel in file.times(chunk) if channel in ids]
+            found += [(file, min(chunks, key=lambda each: each.start), own)]
+            found += [(file, max(chunks, key=lambda each: each.end), own)]
+    times = [time for file, chunk, own in found for time, channel in file.times(chunk) if channel in own]
     duration = max(times, default=0) - min(times, default=0)
-    return float(f"{(count - 1) * SECOND / duration:.3g}") if count > 1 and duration > 0 else None
+    return float(f"{(count - 1) * SECOND / duration:.3g}") if duration > 0 else None
 
 
 def _channels(bag: "Bag") -> list[dict[str, Any]]:
