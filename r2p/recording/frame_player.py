@@ -57,7 +57,10 @@ class FramePlayer:
         end: int | None = None,
         anyway: bool = False,
     ) -> None:
-        """Choose the bus. Raises BagError if the bag has no frames of it, TransportError for a URL without CAN bus."""
+        """Choose the bus.
+
+        Raises BagError if the bag has no frames of it, and TransportError for a URL that has no CAN bus.
+        """
         reader = BusReader(bag)
         self.bus = reader.bus(bus)
         """The bus of the recording that is played."""
