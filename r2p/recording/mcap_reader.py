@@ -252,12 +252,13 @@ def messages(data: bytes, wanted: "Container[int] | None", start: int, end: int)
         raise BagError(f"a chunk has more than {MESSAGES_MAX} messages")
     found: list[MessageRecord] = []
     unpack, add, at, size = MESSAGE_RECORD.unpack_from, found.append, 0, len(data)
-    while at + MESSAGE_RECORD.size <= size:
+    head, shortest = MESSAGE_RECORD.size, MESSAGE.size
+    while at + head <= size:
         opcode, length, channel, sequence, log_time, publish_time = unpack(data, at)
-        begin, at = at + MESSAGE_RECORD.size, at + RECORD_HEAD.size + length
+        begin, at = at + head, at + RECORD_HEAD.size + length
         if opcode != Opcode.MESSAGE:
             continue
-        if length < MESSAGE.size or at > size:
+        if length < shortest or at > size:
             break
         if start <= log_time < end and (wanted is None or channel in wanted):
             add((log_time, channel, sequence, publish_time, data[begin:at]))

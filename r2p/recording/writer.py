@@ -26,6 +26,7 @@ CHUNK_SIZE = 256 << 10
 ABOUT: Final = {"format": f"{FORMAT}", "r2p": __version__}
 """What the metadata record `r2p` says."""
 
+_FIXED = MESSAGE.size  # looked up for each message
 _IDS_MAX = 0xFFFF
 
 
@@ -111,7 +112,7 @@ class BagWriter:
 
     def add(self, channel: int, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
         """Write a message; times in ns since 1970."""
-        head = MESSAGE_RECORD.pack(Opcode.MESSAGE, MESSAGE.size + len(data), channel, sequence, log_time, publish_time)
+        head = MESSAGE_RECORD.pack(Opcode.MESSAGE, _FIXED + len(data), channel, sequence, log_time, publish_time)
         size = self._size
         self._indexes[channel] += (log_time, size)
         self._parts += (head, data)
