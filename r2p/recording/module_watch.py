@@ -1,7 +1,8 @@
 """What a recorder asks of one module: its statistics, once a second, and its parameters with their changes.
 
-Each module has tasks of its own, so a slow or silent one delays no other. A slow one is asked less often: questions
-take a fifth of the time at most.
+Each module has tasks of its own, so a slow or silent one delays no other. A slow one is asked less often. On RTCAN, on
+serial lines, and behind gateways, answers take capacity from the robot: there a module whose answer takes longer than
+5 ms is asked less often than once a second, and each 10 s if it takes 50 ms or more.
 
 The counters of a module only grow, so `growth` is what happened between two answers. A module that ends takes what it
 counted since its last answer with it.
@@ -35,8 +36,11 @@ from r2p.recording.messages import (
 )
 
 _PERIOD = 1.0  # s
-_SHARE = 4  # times as long as an answer took, nothing is asked
+_REST = 4  # times as long as an answer took, nothing is asked ...
+_REST_SLOW = 200  # ... where links may be slow, whose capacity is for the robot ...
+_PERIOD_SLOW = 10.0  # s, ... but no longer than this, or than the former
 _COUNT_MAX = (1 << 64) - 1  # sums of what modules say may be greater
+_TOOL = "recorder"  # the name for what `r2p bag record` has lost itself, such as on its link
 _RETRY = 5.0  # s until a module that does not answer is asked again
 
 Parameters = dict[tuple[str, str], ParameterInfo]
@@ -56,6 +60,7 @@ class ModuleWatch:
         self._clock = module.space.clock
         self._since = since
         self._is_own = name == module.name
+        self._is_tool = self._is_own and module.observer
         self._took = 0.0  # s, the last answer
         self._silent = False
 
@@ -66,7 +71,19 @@ class ModuleWatch:
             tasks.create_task(self._follow_statistics())
 
     async def _pause(self, period: float = _PERIOD) -> None:
-        await asyncio.sleep(max(period, _SHARE * self._took))
+        rest = _REST * self._took
+        if not self._is_near():
+            rest = max(rest, min(_REST_SLOW * self._took, _PERIOD_SLOW))
+        await asyncio.sleep(max(period, rest))
+
+    def _is_near(self) -> bool:
+        """Return whether a fast link leads to the module, without a gateway in between."""
+        return self._is_own or any(
+            info.name == self.name and not info.hops
+            for link in self._module.links
+            if link.up and not link.has_slots and link.calls.is_fast
+            for info in link.discovery.modules.values()
+        )
 
     # Statistics
 
@@ -84,12 +101,13 @@ class ModuleWatch:
             now = self._clock.monotonic()
             self._took = (now - started) * 1e-9
             self._note_answer()
-            self._record(f"{STATISTICS}/{self.name}", statistics)
+            if not self._is_tool:  # whose name is a random one
+                self._record(f"{STATISTICS}/{self.name}", statistics)
             if before is None and statistics.uptime < (now - self._since) * 1e-9:
                 before = ModuleStatistics()
             if before is not None:
                 interval = (now - asked_at) * 1e-9
-                for signal in growth(self.name, before, statistics, own=self._is_own):
+                for signal in growth(_TOOL if self._is_tool else self.name, before, statistics, own=self._is_own):
                     self._record(SIGNALS, msgspec.structs.replace(signal, interval=interval))
             before, asked_at = statistics, now
             await self._pause()

@@ -6,7 +6,7 @@
     /r2p/buses               BusState: master and clock of each RTCAN bus of the recording module, once a second
     /r2p/slots               SlotTable: the owners of the slots of each bus
     /r2p/bus_load/BUS        BusTraffic: all of a bus, once a second; below it, /KIND/TOPIC/MODULE: its parts
-    /r2p/statistics/MODULE   ModuleStatistics, once a second
+    /r2p/statistics/MODULE   ModuleStatistics, once a second; each 10 s where its link is slow
     /r2p/parameters          ParameterValue: all of them at the beginning, then their changes
     attachments              network.json, parameters.toml, and files of the program, such as r2p.toml
 
@@ -150,7 +150,9 @@ class Observations:
                 self._record(EVENTS, event_message(event))
 
     def _record_module(self, view: ModuleView) -> None:
-        """Record that a module is new, or that its state or version is another one."""
+        """Record that a module is new, or that its state or version is another one; but not a tool that records."""
+        if not view.link and self._module.observer:
+            return
         text = ", ".join(filter(None, (view.state, view.kind, view.release)))
         before = self._states.get(view.name)
         if text == before or (before is None and len(self._states) >= _MODULES_MAX):

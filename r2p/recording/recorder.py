@@ -8,6 +8,7 @@ parts of the recorder: each is an asynchronous context manager, made with the mo
 is to be written.
 """
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
@@ -199,6 +200,10 @@ class Recorder:
             raise Closed(f"the recorder of {self.path} was not started: use it in an `async with` block")
         return self._writer
 
+    def _report(self, text: str) -> None:
+        """Log what the writer reports: a limit that the program has set is no fault."""
+        logger.log(logging.INFO if self.stopped.startswith("max_") else logging.WARNING, "%s", text)
+
     # The beginning and the end
 
     async def __aenter__(self) -> Self:
@@ -208,7 +213,7 @@ class Recorder:
         if self._writer is not None:
             raise Error(f"the recorder of {self.path} was started before: make a new one")
         space = self._module.space
-        self._writer = BackgroundWriter(self.path, self._options, space.clock, logger.warning)
+        self._writer = BackgroundWriter(self.path, self._options, space.clock, self._report)
         self._stack.push_async_callback(self._writer.close)
         try:
             await self._begin()

@@ -9,6 +9,8 @@ Misses that a recording has one by one come one by one; `collapsed` joins those 
 import heapq
 import logging
 import re
+from bisect import bisect_left
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from operator import attrgetter, itemgetter
 from typing import Final
@@ -56,8 +58,9 @@ KINDS: Final = {
 
 _KIND_OF_EVENT = {"no answer": "module", "answers": "module", "no master": "master", "events lost": "recorder"}
 _BASELINE = 11 * SECOND  # tables of slots are repeated every ten seconds
+_ANSWER_WITHIN = 15 * SECOND  # on slow links, modules are asked each ten seconds
 _TOGETHER = SECOND  # ns in which the same happenings are joined
-_LOGGED_MISS = re.compile(r"topic (\S+)(?: \(.*?\))?: (.+) \(missed \d+, late \d+ so far\)")
+_LOGGED_MISS = re.compile(r"topic (\S+)(?: \(.*?\))?: (.+) \(missed (\d+), late \d+ so far\)")
 
 _DELAY = re.compile(r" by [\d.]+ ms$")
 
@@ -147,19 +150,48 @@ def _event_text(event: RecordedEvent) -> str:
 
 def _misses(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
     reasons: dict[tuple[str, str], tuple[int, str]] = {}  # by module and topic: when it was logged, and what
-    counted = {each.name.removeprefix(f"{STATISTICS}/") for each in bag.channels}
+    answers: dict[str, list[int]] | None = None
+    signalled = set[str]()  # modules whose signals are there one by one
     logged = ((each.time, each) for each in _log(bag, start, end))
     signals = ((each.log_time, each.message) for each in bag.messages(SIGNALS, RecordedSignal, start=start, end=end))
     merged: Iterator[tuple[int, Happening | RecordedSignal]] = heapq.merge(logged, signals, key=itemgetter(0))
     for time, each in merged:
         if isinstance(each, RecordedSignal):
+            if each.source == "publisher":
+                signalled.add(each.module)
             yield _signal(time, each, reasons)
             continue
         found, module = _LOGGED_MISS.search(each.text), each.about.rpartition("/")[0]
         if found is not None:
             reasons[module, found[1]] = time, _DELAY.sub("", found[2])
-        if found is None or module not in counted:  # else it is there as what the module has counted
-            yield each
+            answers = _answers(bag, start, end) if answers is None else answers
+            if module in signalled or _is_counted(time, answers.get(module, [])):
+                continue
+            each = _logged_miss(each, found)
+        yield each
+
+
+def _logged_miss(logged: Happening, found: re.Match[str]) -> Happening:
+    """Return a miss that a module has logged, and then not counted: it was gone before it was asked again."""
+    topic, reason, missed = found[1], _DELAY.sub("", found[2]), int(found[3])
+    about, text = f"{topic} of {logged.about}", f"{reason}, as it logged"
+    return Happening(time=logged.time, kind="missed" if missed else "late", about=about, text=text)
+
+
+def _answers(bag: Bag, start: int, end: int | None) -> dict[str, list[int]]:
+    """Return when each module has said what it has counted (UTC, ns)."""
+    prefix = f"{STATISTICS}/"
+    until = None if end is None else end + _ANSWER_WITHIN
+    times: dict[str, list[int]] = defaultdict(list)
+    for each in bag.raw(lambda channel: channel.name.startswith(prefix), start=start, end=until):
+        times[each.channel.name.removeprefix(prefix)].append(each.log_time)
+    return times
+
+
+def _is_counted(time: int, answers: list[int]) -> bool:
+    """Return whether a logged miss is also in what its module has counted: some are not, of modules that are gone."""
+    following = bisect_left(answers, time)
+    return following < len(answers) and answers[following] - time <= _ANSWER_WITHIN
 
 
 def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tuple[int, str]]) -> Happening:
@@ -168,7 +200,7 @@ def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tu
     text = signal.reason
     if signal.source == "statistics" and not text:
         logged_at, reason = reasons.get((signal.module, signal.topic), (0, ""))
-        text = f"{reason}, as it logged" if reason and time - logged_at <= 2 * _TOGETHER else "as it counted"
+        text = f"{reason}, as it logged" if reason and time - logged_at <= _ANSWER_WITHIN else "as it counted"
     elif signal.where and signal.topic:
         text = f"{text} ({signal.where})"
     return Happening(

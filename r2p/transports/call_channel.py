@@ -74,6 +74,11 @@ class CallChannel:
         return call_parts.count(MESSAGE_MAX) / self.rate
 
     @property
+    def is_fast(self) -> bool:
+        """Return whether the link carries many more messages than its rate."""
+        return self.rate >= _FAST
+
+    @property
     def full(self) -> bool:
         """Return whether as many messages wait as may."""
         return len(self._waiting) >= _WAITING_MAX

@@ -4,6 +4,7 @@ import asyncio
 import functools
 import itertools
 import json
+import statistics
 from collections import Counter
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -37,8 +38,10 @@ from r2p.recording.messages import (
 from r2p.recording.module_watch import growth
 from r2p.recording.observations import SIGNALS_MAX, Observations
 from r2p.recording.timeline import slots_at, timeline
+from r2p.sim.robots.emulated import Triskar2
 from r2p.sim.transport import SimPort
 from r2p.testing.network import Network, node_in
+from r2p.transports.rtcan.link import RtcanLink
 from tests.tools.rig import VIA, Firmware
 from tests.transports.rtcan.networks import Lab, until
 
@@ -358,3 +361,25 @@ def channels_read_by_others(path: Path) -> Iterator[str]:
         for each in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
             assert each.decoded_message is not None
             yield each.channel.topic.split("/")[2]
+
+
+def test_questions_leave_the_bus_to_the_robot(tmp_path: Path) -> None:
+    """Statistics of seven boards each second would double the load of their bus."""
+
+    async def share(link: RtcanLink, seconds: float) -> float:
+        shares: list[float] = []
+        link.bus_listeners.append(lambda loads, _slots: shares.append(loads[0].share))
+        await asyncio.sleep(seconds)
+        link.bus_listeners.pop()
+        return statistics.fmean(shares)
+
+    async def main() -> None:
+        async with Triskar2("sim:robot", seed=1) as robot, r2p.Module("PC", via="sim:robot") as pc:
+            await robot.ready()
+            link = next(each for each in pc.links if isinstance(each, RtcanLink))
+            before = await share(link, 3.0)
+            async with r2p.Recorder(pc, tmp_path / "drive.mcap", []):
+                await asyncio.sleep(1.0)
+                assert await share(link, 11.0) < before + 0.04
+
+    r2p.sim.run(main)

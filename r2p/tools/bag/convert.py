@@ -52,8 +52,9 @@ async def convert(
 ) -> None:
     """Convert a recording into another format.
 
-    The suffix says which: .mcap, .bag (ROS 1), .csv, .parquet; a folder is rosbag2, or a table for each topic
-    with --to csv or --to parquet. What the other format has no place for is counted and printed.
+    The suffix says which: .mcap, .bag (ROS 1), .csv, .parquet, or for CAN frames .log, .blf and .asc; a folder is
+    rosbag2, or a table for each topic with --to csv or --to parquet. What the other format has no place for is
+    counted and printed.
     """
     from r2p.recording.convert import formats  # only here, as it takes a while
     from r2p.recording.convert.stream import ConversionOptions

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import functools
 import logging
+import re
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from fnmatch import fnmatchcase
@@ -16,6 +17,7 @@ import typer
 import r2p
 from r2p.clock import local_time
 from r2p.ros.std_srvs import Trigger
+from r2p.tools.bag.files import size_text
 from r2p.tools.completion import complete_topic
 from r2p.tools.config import find
 from r2p.tools.keyboard import on_key
@@ -38,6 +40,7 @@ SNAPSHOT_SERVICE = "bag/snapshot"
 _MIN_FREE = 1_000_000_000  # bytes
 _ANSWER_MAX = 160  # characters of an answer to that service, which all links carry
 _LINK_UP = 2.0  # seconds to wait for a link before the recording begins: others may come later
+_OTHERS = (".bag", ".db3", ".log", ".blf", ".asc", ".csv", ".parquet")
 _LIMITS = ("max_size", "max_duration", "split", "snapshot", "min_free", "max_total")
 
 
@@ -59,9 +62,17 @@ def check(settings: Settings, given: Mapping[str, Any]) -> None:
     _stated_types(settings, given["topics"], given["type"])
     _options({name: given[name] for name in _LIMITS})
     output = given["output"]
-    if output is not None and (output.exists() or not output.parent.is_dir()):
-        reason = "exists, and is never overwritten: give another" if output.exists() else "is in no directory: give an"
-        raise UsageError(f"{output} {reason} -o FILE")
+    if output is not None:
+        _check_output(output)
+
+
+def _check_output(output: Path) -> None:
+    if output.exists():
+        raise UsageError(f"{output} exists, and is never overwritten: give another -o FILE")
+    if not output.parent.is_dir():
+        raise UsageError(f"-o {output}: there is no directory '{output.parent}'")
+    if output.suffix in _OTHERS:
+        raise UsageError(f"-o {output}: a recording is an .mcap file; r2p bag convert makes {output.suffix} of it")
 
 
 def has_topics(given: Mapping[str, Any]) -> bool:
@@ -181,8 +192,10 @@ async def _print_summary(recorder: "Recorder", buses: "list[FrameRecorder]", out
         counts[each.bus.topic] = TopicCount(each.frames, dropped, each.lost.total())
     total = sum(each.messages - each.dropped for each in counts.values())
     files = ", ".join(map(str, recorder.paths)) or "no file"
-    what = "snapshots" if recorder.keeps else f"{recorder.bytes_written / 1e6:.1f} MB"
-    notify(f"{total} messages in {seconds:.1f} s; {what}: {files}")
+    what = "snapshots" if recorder.keeps else size_text(recorder.bytes_written)
+    limit, _, reached = recorder.stopped.partition(" ")
+    why = f"; --{limit.replace('_', '-')} {reached}" if limit in _LIMITS else ""
+    notify(f"{total} messages in {seconds:.1f} s; {what}: {files}{why}")
     rows = [{"topic": topic, **msgspec.structs.asdict(each)} for topic, each in counts.items()]
     await output.table(rows, ["topic", "messages", "dropped", "missed"])
 
@@ -300,7 +313,8 @@ def _options(limits: Mapping[str, Any]) -> "RecordingOptions":
     try:
         return RecordingOptions(**{"min_free": _MIN_FREE, **given})
     except ValueError as error:
-        raise UsageError(f"{error}") from error
+        text = re.sub(rf"\b({'|'.join(_LIMITS)})\b(?! of)", lambda name: f"--{name[0].replace('_', '-')}", f"{error}")
+        raise UsageError(text) from error
 
 
 def _stated_types(

@@ -30,7 +30,7 @@ def rows(result: Result) -> list[dict[str, Any]]:
 
 def test_a_window_by_the_time_of_day(path: Path) -> None:
     result = called("events", path, "--start", "22:13:35.1", "--end", "22:13:37")
-    assert [each["kind"] for each in rows(result)] == ["overdue", "master", "master", *["slots"] * 3]
+    assert [each["kind"] for each in rows(result)] == ["overdue", "missed", "master", "master", *["slots"] * 3]
     assert rows(result)[0] == {
         "stamp": START + 15_100_000_000,
         "kind": "overdue",
@@ -40,7 +40,7 @@ def test_a_window_by_the_time_of_day(path: Path) -> None:
         "late": 0.0032,
         "sequence": 8,
     }
-    assert "from 2023-11-14 22:13:35.100 to 22:13:37.000: 1 overdue" in " ".join(result.stderr.split())
+    assert "from 2023-11-14 22:13:35.100 to 22:13:37.000: 1 missed, 1 overdue" in " ".join(result.stderr.split())
 
 
 def test_only_what_is_asked_for(path: Path) -> None:
