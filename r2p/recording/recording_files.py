@@ -199,6 +199,36 @@ class RecordingFiles:
         except OSError as error:
             self._on_error(error)
 
+    def _check_there(self) -> None:
+        """Go on in another file, or end the recording, if another program has deleted the file, or cut it off."""
+        raw, file = self._raw, self._file
+        if raw is None or file is None:
+            return
+        path, found = self.paths[-1], os.fstat(raw.fileno())
+        if not found.st_nlink:
+            named = [(self._name_of(channel), count) for channel, count in file.counts.items()]
+            total = sum(count for name, count in named if not name.startswith(META_PREFIX))
+            why = f"another program has deleted {path} with {total} messages"
+        elif found.st_size < file.size:
+            why = f"another program has cut {path} off: try `r2p bag recover`"
+        else:
+            return
+        before = Counter(self.recorded)
+        if self._options.split:
+            self._report(f"{why}; the recording goes on in the next file")
+            self._next_file()
+        else:
+            self.fail(why)
+        if not found.st_nlink:
+            self._forget(path, self.recorded - before)
+
+    def _forget(self, path: Path, messages: Counter[str]) -> None:
+        """Count the messages of a file that is gone as lost."""
+        self.recorded -= messages
+        self.lost.update({name: count for name, count in messages.items() if not name.startswith(META_PREFIX)})
+        self.paths.remove(path)
+        self._sizes.pop(path, None)
+
     def _check_free(self) -> None:
         while self._options.min_free and self._free() < self._options.min_free:
             if not self._delete_oldest():
@@ -212,6 +242,8 @@ class RecordingFiles:
             self._keep()
             return
         ready = self.writer.ready
+        if ready:
+            self._check_there()
         while ready and self._file is not None:
             item = ready[0]
             if isinstance(item, PackedChunk) and self._over(item):

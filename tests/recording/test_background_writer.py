@@ -225,6 +225,34 @@ async def test_a_full_disk_ends_the_recording_with_a_file_that_is_right(size: in
 
 
 @pytest.mark.virtual_time
+async def test_a_file_that_another_program_deletes_or_cuts_off_is_noticed(tmp_path: Path) -> None:
+    disk, reports = open_disk(tmp_path / "a.mcap")
+    await record(disk, 100)
+    disk.paths[0].unlink()
+    await record(disk, 200)
+    await disk.close()
+    assert [each.partition(" with ")[0] for each in reports] == [
+        f"the recording ended: another program has deleted {tmp_path / 'a.mcap'}"
+    ]
+    assert (disk.paths, disk.recorded, disk.lost) == ([], {}, {"leds": 300})
+    disk, reports = open_disk(tmp_path / "b.mcap", split=True, max_size=1 << 30)
+    await record(disk, 100)
+    os.truncate(disk.paths[0], 5_000)
+    await record(disk, 100)
+    disk.paths[1].unlink()
+    await record(disk, 100)
+    await disk.close()
+    first, third = disk.paths
+    assert [each.partition(" off:")[0].partition(" with ")[0] for each in reports] == [
+        f"another program has cut {first}",
+        f"another program has deleted {tmp_path / 'b-0002.mcap'}",
+    ]
+    assert all(each.endswith("; the recording goes on in the next file") for each in reports)
+    assert len(sequences(third)) + disk.recorded["leds"] + disk.lost["leds"] > 300
+    assert disk.recorded["leds"] + disk.lost["leds"] == 300
+
+
+@pytest.mark.virtual_time
 async def test_a_disk_that_fails_leaves_a_file_to_recover(tmp_path: Path) -> None:
     path = tmp_path / "gone.mcap"
     disk, reports = open_disk(path, opened=Quota(50_000, errno.EIO).open)

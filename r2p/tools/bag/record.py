@@ -170,9 +170,10 @@ async def _record(
     clock = session.module.space.clock
     began = clock.monotonic()
     try:
-        async with recorder:
-            with _snapshots(session, recorder), _hints(session, topics):
-                await recorder.wait()
+        with _ending_at_hangup():
+            async with recorder:
+                with _snapshots(session, recorder), _hints(session, topics):
+                    await recorder.wait()
     except OSError as error:
         raise r2p.Error(f"can't write {recorder.path}: {error.strerror}") from error
     finally:
@@ -201,6 +202,24 @@ async def _print_summary(recorder: "Recorder", buses: "list[FrameRecorder]", out
 
 
 @contextlib.contextmanager
+def _ending_at_hangup() -> Iterator[None]:
+    """End the file as at Ctrl-C when the terminal, or the connection to this computer, is closed; not with nohup."""
+    ending = False
+
+    def end() -> None:
+        nonlocal ending
+        if not ending:  # the kernel and the shell may send one each
+            ending = True
+            signal.raise_signal(signal.SIGTERM)
+
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        yield
+        return
+    with _on_signal(signal.SIGHUP, end):
+        yield
+
+
+@contextlib.contextmanager
 def _hints(session: Session, topics: list[str]) -> Iterator[None]:
     """Report after a while which of the topics have no publisher."""
 
@@ -221,7 +240,7 @@ def _hints(session: Session, topics: list[str]) -> Iterator[None]:
 def _snapshots(session: Session, recorder: "Recorder") -> Iterator[None]:
     """Write a snapshot at SIGUSR1, at the key s, and when the service is called."""
     if not recorder.keeps:
-        with _on_sigusr1(lambda: notify("there is no snapshot to write: start with --snapshot 30s")):
+        with _on_signal(signal.SIGUSR1, lambda: notify("there is no snapshot to write: start with --snapshot 30s")):
             notify(f"recording into {recorder.path}; Ctrl-C ends it")
             yield
         return
@@ -243,24 +262,24 @@ def _snapshots(session: Session, recorder: "Recorder") -> Iterator[None]:
 
     session.node.log.logger.setLevel(logging.ERROR)  # it would warn of answers that are too long: see _ANSWER_MAX
     session.node.serve(SNAPSHOT_SERVICE, Trigger, write)
-    with _on_sigusr1(start), on_key(lambda key: start() if key == "s" else None) as has_keyboard:
+    with _on_signal(signal.SIGUSR1, start), on_key(lambda key: start() if key == "s" else None) as has_keyboard:
         how = "s writes them" if has_keyboard else f"SIGUSR1 and the service {SNAPSHOT_SERVICE} write them"
         notify(f"keeping the last seconds in memory; {how}, Ctrl-C ends it")
         yield
 
 
 @contextlib.contextmanager
-def _on_sigusr1(call: Callable[[], object]) -> Iterator[None]:
+def _on_signal(number: signal.Signals, call: Callable[[], object]) -> Iterator[None]:
     loop = asyncio.get_running_loop()
     try:
-        loop.add_signal_handler(signal.SIGUSR1, call)
+        loop.add_signal_handler(number, call)
     except (NotImplementedError, RuntimeError, ValueError):  # under virtual time, or not in the main thread
         yield
         return
     try:
         yield
     finally:
-        loop.remove_signal_handler(signal.SIGUSR1)
+        loop.remove_signal_handler(number)
 
 
 def _buses(settings: Settings) -> list[str]:

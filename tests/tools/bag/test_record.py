@@ -148,7 +148,7 @@ def test_a_process_ends_its_file_and_writes_snapshots_at_signals(tmp_path: Path)
             assert "keeping the last seconds" in child.stderr.readline()
             child.send_signal(signal.SIGUSR1)
             assert f"snapshot: {tmp_path}/one-0001.mcap" in child.stderr.readline()
-            child.terminate()
+            child.send_signal(signal.SIGHUP)  # the terminal is closed
             assert child.wait() == 0
         with process(*arguments, "--max-duration", "1", "--min-free", "0") as child:
             output, _ = child.communicate()
