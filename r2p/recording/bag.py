@@ -68,7 +68,7 @@ class RawMessage(msgspec.Struct, frozen=True, gc=False):
 
 
 def is_of(topics: Collection[str] | None, kinds: Collection[str]) -> Callable[[BagChannel], bool]:
-    """Return whether a channel has to do with these topics (None: all), as one of these kinds."""
+    """Return a function that says whether a channel is of these topics (None: all) and of one of these kinds."""
     names = None if topics is None else {each.removeprefix("/") for each in topics}
     return lambda each: each.info is not None and each.kind in kinds and (names is None or each.info.topic in names)
 

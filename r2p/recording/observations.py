@@ -46,7 +46,8 @@ from r2p.version import __version__
 SIGNALS_MAX = 1000
 """Signals in a second that are recorded one by one; further ones are added up, by publisher and reason."""
 
-_SETTLED, _PATIENCE = 3 * SECOND, 10 * SECOND  # after which the network is known, and described in attachments
+_SETTLED = 3 * SECOND  # ns after which the network is known, and described in attachments
+_SETTLED_WITHOUT_ANSWERS = 10 * SECOND  # ns, the same if modules are silent
 _FIRMWARE_SILENT = 15.0  # s; it says ALIVE once in all its announcements, one of which it sends each half second
 _MODULES_MAX = 256  # modules that are asked: names come from the network, and channels of a file stay
 
@@ -209,7 +210,7 @@ class Observations:
         """Return whether the network has announced all that it has, and its modules have answered or had their time."""
         elapsed = self._clock.monotonic() - self._began
         answered = all(watch.parameters is not None for watch, _ in self._watches.values())
-        return elapsed >= _SETTLED and (answered or elapsed >= _PATIENCE)
+        return elapsed >= _SETTLED and (answered or elapsed >= _SETTLED_WITHOUT_ANSWERS)
 
     def _describe(self) -> None:
         """Attach descriptions of the network, once."""

@@ -106,7 +106,7 @@ class PlayedPublisher:
             self.missed[NO_ROOM if any(sink.reachable for sink in lost) else LINK_DOWN] += 1
         if waiting:
             self._pending.append(
-                _PlayedDelivery(self, sample, waiting, self._clock.monotonic() + self._patience(sample))
+                _PlayedDelivery(self, sample, waiting, self._clock.monotonic() + self._waiting_time(sample))
             )
             if len(self._pending) > _PENDING_MAX:
                 self._expire(self._pending[0])
@@ -122,7 +122,7 @@ class PlayedPublisher:
         sink.force(sample)
         return sink.lost > lost
 
-    def _patience(self, sample: Sample) -> int:
+    def _waiting_time(self, sample: Sample) -> int:
         """Return for how long a message waits for room (ns)."""
         if self.publisher_class is _NRT:
             return _STALL

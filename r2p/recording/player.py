@@ -249,7 +249,7 @@ class Player:
             and (topic.queues or any(each.reachable for each in topic.remote_subscribers))
         ]
 
-    def rivals(self) -> dict[str, list[str]]:
+    def other_publishers(self) -> dict[str, list[str]]:
         """Return the topics that other modules publish now, each with these publishers (`MODULE/node`)."""
         views = self._module.network.topics()
         found: dict[str, list[str]] = {}

@@ -54,18 +54,18 @@ KINDS: Final = {
     "notice": "other notices: mismatches of types, conflicts of names, ...",
     "recorder": "messages that the recorder itself lost",
 }
-"""The kinds of happenings, and what they are."""
+"""The kinds of events, and what they are."""
 
 _KIND_OF_EVENT = {"no answer": "module", "answers": "module", "no master": "master", "events lost": "recorder"}
 _BASELINE = 11 * SECOND  # tables of slots are repeated every ten seconds
 _ANSWER_WITHIN = 15 * SECOND  # on slow links, modules are asked each ten seconds
-_TOGETHER = SECOND  # ns in which the same happenings are joined
+_TOGETHER = SECOND  # ns in which the same events are joined
 _LOGGED_MISS = re.compile(r"topic (\S+)(?: \(.*?\))?: (.+) \(missed (\d+), late \d+ so far\)")
 
 _DELAY = re.compile(r" by [\d.]+ ms$")
 
 
-class Happening(msgspec.Struct, frozen=True, kw_only=True):
+class TimelineEvent(msgspec.Struct, frozen=True, kw_only=True):
     """Something that happened at `time` (UTC, ns), of one of KINDS.
 
     `about` names the link, module, topic or bus. `count` messages are concerned, the latest by `late` seconds.
@@ -81,14 +81,14 @@ class Happening(msgspec.Struct, frozen=True, kw_only=True):
     sequence: int = 0
     until: int = 0
 
-    def joined(self, other: "Happening") -> "Happening":
+    def joined(self, other: "TimelineEvent") -> "TimelineEvent":
         """Return this and a later one as one."""
         return msgspec.structs.replace(
             self, count=self.count + other.count, late=max(self.late, other.late), until=other.time
         )
 
 
-def timeline(bag: Bag, start: int | None = None, end: int | None = None) -> Iterator[Happening]:
+def timeline(bag: Bag, start: int | None = None, end: int | None = None) -> Iterator[TimelineEvent]:
     """Yield what happened from `start` to `end` (UTC, ns; `end` not included; None: of the recording)."""
     first = bag.start if start is None else start
     parts = (_events(bag, first, end), _misses(bag, first, end), _slots(bag, first, end), _parameters(bag, first, end))
@@ -96,10 +96,10 @@ def timeline(bag: Bag, start: int | None = None, end: int | None = None) -> Iter
     return heapq.merge(*parts, *others, key=attrgetter("time"))
 
 
-def collapsed(happenings: Iterable[Happening]) -> Iterator[Happening]:
-    """Join happenings that repeat within a second of the first one: they differ in time, number and delay only."""
-    waiting: dict[tuple[str, str, str], Happening] = {}
-    for each in happenings:
+def collapsed(events: Iterable[TimelineEvent]) -> Iterator[TimelineEvent]:
+    """Join events that repeat within a second of the first one: they differ in time, number and delay only."""
+    waiting: dict[tuple[str, str, str], TimelineEvent] = {}
+    for each in events:
         key = each.kind, each.about, each.text
         while waiting and (oldest := next(iter(waiting.values()))).time < each.time - _TOGETHER:
             yield waiting.pop((oldest.kind, oldest.about, oldest.text))
@@ -119,13 +119,13 @@ def slots_at(bag: Bag, time: int) -> list[SlotTable]:
 # Events
 
 
-def _events(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+def _events(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     for each in bag.messages(EVENTS, RecordedEvent, start=start, end=end):
         event = each.message
         word = event.kind.partition(" ")[0]
         kind = _KIND_OF_EVENT.get(event.kind, word if word in KINDS else "notice")
         subject = event.module or event.topic if kind in ("module", "notice") else event.link
-        yield Happening(time=each.log_time, kind=kind, about=subject or event.link, text=_event_text(event))
+        yield TimelineEvent(time=each.log_time, kind=kind, about=subject or event.link, text=_event_text(event))
 
 
 def _event_text(event: RecordedEvent) -> str:
@@ -148,13 +148,13 @@ def _event_text(event: RecordedEvent) -> str:
 # Misses, with the reasons that logs have
 
 
-def _misses(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+def _misses(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     reasons: dict[tuple[str, str], tuple[int, str]] = {}  # by module and topic: when it was logged, and what
     answers: dict[str, list[int]] | None = None
     signalled = set[str]()  # modules whose signals are there one by one
     logged = ((each.time, each) for each in _log(bag, start, end))
     signals = ((each.log_time, each.message) for each in bag.messages(SIGNALS, RecordedSignal, start=start, end=end))
-    merged: Iterator[tuple[int, Happening | RecordedSignal]] = heapq.merge(logged, signals, key=itemgetter(0))
+    merged: Iterator[tuple[int, TimelineEvent | RecordedSignal]] = heapq.merge(logged, signals, key=itemgetter(0))
     for time, each in merged:
         if isinstance(each, RecordedSignal):
             if each.source == "publisher":
@@ -171,11 +171,11 @@ def _misses(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
         yield each
 
 
-def _logged_miss(logged: Happening, found: re.Match[str]) -> Happening:
+def _logged_miss(logged: TimelineEvent, found: re.Match[str]) -> TimelineEvent:
     """Return a miss that a module has logged, and then not counted: it was gone before it was asked again."""
     topic, reason, missed = found[1], _DELAY.sub("", found[2]), int(found[3])
     about, text = f"{topic} of {logged.about}", f"{reason}, as it logged"
-    return Happening(time=logged.time, kind="missed" if missed else "late", about=about, text=text)
+    return TimelineEvent(time=logged.time, kind="missed" if missed else "late", about=about, text=text)
 
 
 def _answers(bag: Bag, start: int, end: int | None) -> dict[str, list[int]]:
@@ -194,7 +194,7 @@ def _is_counted(time: int, answers: list[int]) -> bool:
     return following < len(answers) and answers[following] - time <= _ANSWER_WITHIN
 
 
-def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tuple[int, str]]) -> Happening:
+def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tuple[int, str]]) -> TimelineEvent:
     owner = f"{signal.module}/{signal.node}" if signal.node else signal.module
     about = f"{signal.topic} of {owner}" if signal.topic else f"link {signal.where} of {owner}"
     text = signal.reason
@@ -203,7 +203,7 @@ def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tu
         text = f"{reason}, as it logged" if reason and time - logged_at <= _ANSWER_WITHIN else "as it counted"
     elif signal.where and signal.topic:
         text = f"{text} ({signal.where})"
-    return Happening(
+    return TimelineEvent(
         time=time,
         kind=signal.kind if signal.kind in KINDS else "notice",
         about=about,
@@ -214,15 +214,15 @@ def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tu
     )
 
 
-def _log(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+def _log(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     for each in bag.messages(LOGS, LogRecord, start=start, end=end):
         record = each.message
         if record.level >= logging.WARNING:
             text = f"{logging.getLevelName(record.level)}: {record.msg}"
-            yield Happening(time=each.log_time, kind="log", about=record.name, text=text)
+            yield TimelineEvent(time=each.log_time, kind="log", about=record.name, text=text)
 
 
-def _overdue(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+def _overdue(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     """Yield the messages that came after their deadline; by the clock of the recorder, where that is known."""
     for each in bag.raw(lambda channel: channel.kind == "meta", start=start, end=end):
         info = each.channel.info
@@ -233,7 +233,7 @@ def _overdue(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
         due = meta.expires or meta.deadline
         if info is not None and 0 < due < each.log_time:
             owner = "/".join(filter(None, (info.module, info.node)))
-            yield Happening(
+            yield TimelineEvent(
                 time=each.log_time,
                 kind="overdue",
                 about=f"{info.topic} of {owner}" if owner else info.topic,
@@ -246,7 +246,7 @@ def _overdue(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
 # Changes
 
 
-def _slots(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+def _slots(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     before: dict[str, dict[tuple[str, str], SlotOwner]] = {}
     for each in bag.messages(SLOTS, SlotTable, start=start - _BASELINE, end=end):
         table = each.message
@@ -259,7 +259,7 @@ def _slots(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
             text = _slots_text(known.get(key), owners.get(key))
             if text:
                 about = f"{key[0]} of {key[1]}" if key[0] else "unused slots"
-                yield Happening(time=each.log_time, kind="slots", about=about, text=f"{text} on {table.bus}")
+                yield TimelineEvent(time=each.log_time, kind="slots", about=about, text=f"{text} on {table.bus}")
 
 
 def _slots_text(before: SlotOwner | None, after: SlotOwner | None) -> str:
@@ -274,7 +274,7 @@ def _numbers(owner: SlotOwner) -> str:
     return f"slot{'' if len(owner.slots) == 1 else 's'} {', '.join(map(str, owner.slots))}"
 
 
-def _parameters(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+def _parameters(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     values: dict[tuple[str, str, str], ParameterValue] = {}
     for each in bag.messages(PARAMETERS, ParameterValue, end=end):
         new = each.message
@@ -284,10 +284,10 @@ def _parameters(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
             continue
         text = "gone" if new.gone else f"{f'{new.value} {new.unit}'.rstrip()}, was {before.value} ({new.origin})"
         about = f"{new.module}/{new.node}.{new.name}"
-        yield Happening(time=each.log_time, kind="parameter", about=about, text=text)
+        yield TimelineEvent(time=each.log_time, kind="parameter", about=about, text=text)
 
 
-def _recorder(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
+def _recorder(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     """Yield what the recorder lost; its messages have totals."""
     before: dict[str, tuple[int, int]] = {}
     for each in bag.messages(LOSSES, RecorderLosses, end=end):
@@ -300,4 +300,4 @@ def _recorder(bag: Bag, start: int, end: int | None) -> Iterator[Happening]:
             }
             for text, count in grown.items():
                 if count > 0 and each.log_time >= start:
-                    yield Happening(time=each.log_time, kind="recorder", about=topic.topic, text=text, count=count)
+                    yield TimelineEvent(time=each.log_time, kind="recorder", about=topic.topic, text=text, count=count)

@@ -282,8 +282,8 @@ async def test_other_publishers_of_the_topics_are_seen(tmp_path: Path) -> None:
         node.advertise("speed", Speed3)
         await asyncio.sleep(1)
         with Bag(path) as bag:
-            assert Player(source, bag).rivals() == {"speed": ["MOTOR1/wheel"]}
-            assert Player(source, bag, PlayOptions(remap={"speed": "old/speed"})).rivals() == {}
+            assert Player(source, bag).other_publishers() == {"speed": ["MOTOR1/wheel"]}
+            assert Player(source, bag, PlayOptions(remap={"speed": "old/speed"})).other_publishers() == {}
 
 
 async def test_loops_and_ends(tmp_path: Path) -> None:

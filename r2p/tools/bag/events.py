@@ -12,7 +12,7 @@ from r2p.tools.session import UsageError
 
 if TYPE_CHECKING:
     from r2p.recording.bag import Bag
-    from r2p.recording.timeline import Happening
+    from r2p.recording.timeline import TimelineEvent
 
 _KINDS = (
     *("link", "module", "master", "slots", "missed", "late", "overdue", "lost", "degraded"),
@@ -59,11 +59,11 @@ async def events(
     output = Output(format)
     with opened(file) as bag:
         first, last = span((bag.start, bag.end), start, end)
-        found = (happening for happening in timeline(bag, first, last) if not kinds or happening.kind in kinds)
+        found = (event for event in timeline(bag, first, last) if not kinds or event.kind in kinds)
         counts: dict[str, int] = {}
-        for happening in found if each or output.format != "text" else collapsed(found):
-            counts[happening.kind] = counts.get(happening.kind, 0) + (happening.count or 1)
-            await output.put(_record(happening), _line(happening), colour=_colour(happening), wrap=True)
+        for event in found if each or output.format != "text" else collapsed(found):
+            counts[event.kind] = counts.get(event.kind, 0) + (event.count or 1)
+            await output.put(_record(event), _line(event), colour=_colour(event), wrap=True)
         _summarise(bag, counts, first, last)
 
 
@@ -90,40 +90,40 @@ def _summarise(bag: "Bag", counts: dict[str, int], first: int | None, last: int 
         notify(f"nothing {when}{why}")
 
 
-def _record(happening: "Happening") -> dict[str, Any]:
+def _record(event: "TimelineEvent") -> dict[str, Any]:
     return {
-        "stamp": happening.time,
-        "kind": happening.kind,
-        "about": happening.about,
-        "text": happening.text,
-        "count": happening.count,
-        "late": happening.late,
-        "sequence": happening.sequence,
+        "stamp": event.time,
+        "kind": event.kind,
+        "about": event.about,
+        "text": event.text,
+        "count": event.count,
+        "late": event.late,
+        "sequence": event.sequence,
     }
 
 
-def _line(happening: "Happening") -> str:
-    details = [happening.text]
-    if happening.late:
-        most = "at most " if happening.until else ""
-        details.append(f"{most}{happening.late * 1e3:.1f} ms late")
-    if happening.until:
-        details.append(f"{happening.count} until {shown(happening.until, date=False)}")
-    elif happening.count > 1:
-        details.append(f"{happening.count} messages")
-    elif happening.sequence and happening.count:
-        details.append(f"message {happening.sequence}")
-    time = shown(happening.time, date=False)
-    about = f"{happening.about}: " if happening.about else ""
-    return f"{time} {happening.kind:<{_WIDTH}} {about}{', '.join(details)}"
+def _line(event: "TimelineEvent") -> str:
+    details = [event.text]
+    if event.late:
+        most = "at most " if event.until else ""
+        details.append(f"{most}{event.late * 1e3:.1f} ms late")
+    if event.until:
+        details.append(f"{event.count} until {shown(event.until, date=False)}")
+    elif event.count > 1:
+        details.append(f"{event.count} messages")
+    elif event.sequence and event.count:
+        details.append(f"message {event.sequence}")
+    time = shown(event.time, date=False)
+    about = f"{event.about}: " if event.about else ""
+    return f"{time} {event.kind:<{_WIDTH}} {about}{', '.join(details)}"
 
 
-def _colour(happening: "Happening") -> int | None:
-    bad = happening.kind == "link" and not happening.text.startswith("up")
-    silent = happening.kind == "module" and happening.text.startswith(("silent", "no answer"))
-    if happening.kind in _RED or bad or silent or (happening.kind == "slots" and "lost" in happening.text):
+def _colour(event: "TimelineEvent") -> int | None:
+    bad = event.kind == "link" and not event.text.startswith("up")
+    silent = event.kind == "module" and event.text.startswith(("silent", "no answer"))
+    if event.kind in _RED or bad or silent or (event.kind == "slots" and "lost" in event.text):
         return 31
-    return 33 if happening.kind in _YELLOW or happening.text.startswith("no RTCAN master") else None
+    return 33 if event.kind in _YELLOW or event.text.startswith("no RTCAN master") else None
 
 
 async def slots(

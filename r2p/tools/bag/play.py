@@ -163,14 +163,14 @@ class _MessagePlay:
 
         player = self._player
         await self._session.settle()
-        self._check_rivals("is published by", "two publishers of a topic confuse its subscribers")
+        self._check_others("is published by", "two publishers of a topic confuse its subscribers")
         async with player:
             await self._wait_for_subscribers()
             controls = Controls(player.pacer, player.start, player.end, player.played.total, "messages")
             began = asyncio.get_running_loop().time()
             try:
                 with controls.running():
-                    await _first(player.run(), self._watch_rivals())
+                    await _first(player.run(), self._watch_others())
                     await wait_until(lambda: not player.waiting, _DRAIN)
             finally:
                 self._report(asyncio.get_running_loop().time() - began)
@@ -189,14 +189,14 @@ class _MessagePlay:
                 f"--wait-for {next(iter(player.topics))} waits for a subscriber"
             )
 
-    def _check_rivals(self, verb: str, why: str) -> None:
-        rivals = self._player.rivals()
-        if not rivals or self._anyway:
+    def _check_others(self, verb: str, why: str) -> None:
+        others = self._player.other_publishers()
+        if not others or self._anyway:
             return
-        topic, publishers = next(iter(rivals.items()))
+        topic, publishers = next(iter(others.items()))
         more = (
-            f", and {len(rivals) - 1} more topics that are to be played are published as well"
-            if len(rivals) > 1
+            f", and {len(others) - 1} more topics that are to be played are published as well"
+            if len(others) > 1
             else ""
         )
         raise r2p.Error(
@@ -204,11 +204,11 @@ class _MessagePlay:
             f"under another name with --remap {topic}:=recorded/{topic}, or play all the same with --anyway"
         )
 
-    async def _watch_rivals(self) -> None:
+    async def _watch_others(self) -> None:
         """End playing when another module begins to publish a topic: it may be what moves the motors."""
         while True:
             await asyncio.sleep(_LOOK_EVERY)
-            self._check_rivals("is now published by", "playing has ended")
+            self._check_others("is now published by", "playing has ended")
 
     def _report(self, seconds: float) -> None:
         player = self._player
