@@ -11,6 +11,8 @@ python-can has times as floating-point seconds since 1970, which are good for 0.
 
 import contextlib
 import logging
+import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,11 @@ _MICROSECOND = 1000  # ns
 _US_PER_S = 1_000_000
 _START = "Start of measurement"
 _ASC = ".asc"
+_OBJECT = struct.Struct("<4sHHLL")  # of BLF: signature, two numbers, length with this head, kind
+_OBJECT_SIGNATURE = b"LOBJ"
+_CONTAINER, _DEFLATED = 10, 2
+_CONTAINER_HEAD = 16  # bytes
+_CONTAINER_MAX = 1 << 24  # bytes of objects; those of Vector's tools have 128 kB
 
 logging.getLogger("can.io").setLevel(logging.ERROR)  # python-can warns for each object that it does not know
 
@@ -61,7 +68,44 @@ def _reader(path: Path) -> Iterator[Any]:
             yield can.ASCReader(text, relative_timestamp=False)
     else:
         with path.open("rb") as binary:
-            yield can.BLFReader(binary)
+            yield _BlfReader(binary)
+
+
+class _BlfReader(can.BLFReader):
+    """python-can's reader, but for damage by which that would never end, or take all memory."""
+
+    def __iter__(self) -> Iterator[can.Message]:  # type: ignore[override]
+        while head := self.file.read(_OBJECT.size):
+            signature, _, _, size, kind = _OBJECT.unpack(head)
+            if signature != _OBJECT_SIGNATURE or size < _OBJECT.size:
+                raise ValueError("an object is damaged")
+            body = self.file.read(size - _OBJECT.size)
+            self.file.read(size % 4)  # padding
+            if kind == _CONTAINER:
+                yield from self._parse_container(_unpacked(body))
+
+    def _parse_container(self, data: bytes) -> Iterator[can.Message]:
+        data, self._tail = self._tail + data, b""
+        at = 0
+        while (at := data.find(_OBJECT_SIGNATURE, at, at + 8)) >= 0 and at + _OBJECT.size <= len(data):
+            size = _OBJECT.unpack_from(data, at)[3]
+            if not _OBJECT.size <= size <= _CONTAINER_MAX:
+                raise ValueError("the length of an object is wrong")
+            at += size
+        yield from super()._parse_container(data)
+
+
+def _unpacked(body: bytes) -> bytes:
+    """Return what is in a container. Raises ValueError or an error of zlib or struct."""
+    (method,) = struct.unpack_from("<H", body)
+    packed = body[_CONTAINER_HEAD:]
+    if method == _DEFLATED:
+        packed = zlib.decompressobj().decompress(packed, _CONTAINER_MAX + 1)
+    elif method:
+        raise ValueError(f"compression {method} of a container is unknown")
+    if len(packed) > _CONTAINER_MAX:
+        raise ValueError("a container is too long")
+    return packed
 
 
 def _frame(message: can.Message) -> RecordedFrame | str:

@@ -4,15 +4,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rosbags.rosbag1 import Reader, ReaderError, Writer
+from rosbags.rosbag1 import Reader, Writer
 
 from r2p.errors import BagError, MessageError
 from r2p.recording.convert.ros_messages import records_of, ros_schema
 from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
 from r2p.units import SECOND
 
-_DAMAGE = ReaderError, AssertionError, LookupError, ValueError, TypeError, EOFError, RuntimeError, MemoryError
-"""What rosbags raises for files that are not as they should be."""
 _LATEST = 1 << 32  # seconds since 1970, from which on ROS 1 has no times
 
 
@@ -21,7 +19,9 @@ def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[Con
     try:
         with Reader(path) as reader:
             yield from records_of(reader, 1, options, losses)
-    except _DAMAGE as error:
+    except Exception as error:  # rosbags, and what it uses, have errors of many kinds
+        if isinstance(error, BagError) or (isinstance(error, OSError) and error.errno):
+            raise
         raise BagError(f"{path} is damaged, or was not finished: {error}; `rosbag reindex` may help") from error
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 from mcap.reader import make_reader
 from mcap.summary import Summary
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import Reader
 
 from r2p.errors import BagError, DecodeError, MessageError
 from r2p.messages import Message
@@ -40,7 +40,9 @@ def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[Con
         else:
             with Reader(path) as reader:
                 yield from records_of(reader, 2, options, losses)
-    except (ReaderError, yaml.YAMLError, UnicodeDecodeError) as error:
+    except Exception as error:  # rosbags, and what it uses, have errors of many kinds
+        if isinstance(error, BagError) or (isinstance(error, OSError) and error.errno):
+            raise
         raise BagError(f"{path} is damaged, or was not finished: {error}; `ros2 bag reindex` may help") from error
 
 
@@ -55,7 +57,10 @@ def _plain_files(path: Path) -> list[Path]:
         }:
             if info.get("compression_mode"):
                 return []
-            return [path / Path(str(name)).name for name in names]
+            found = [path / Path(str(name)).name for name in names]
+            if not all(map(Path.is_file, found)):
+                raise BagError(f"{path} lacks one of the files that its {_METADATA} names")
+            return found
         case _:
             return []
 

@@ -1,6 +1,8 @@
 """Recordings of strangers: nothing is written outside of the target, and nothing that exists is lost."""
 
 import os
+import struct
+import zlib
 from pathlib import Path
 
 import pytest
@@ -68,3 +70,30 @@ def test_a_line_without_an_end_is_read_in_pieces(tmp_path: Path) -> None:
         file.truncate(10_000)
     with pytest.raises(r2p.BagError, match="3 lines that are not frames"):
         convert(tmp_path / "drive.log", tmp_path / "out.mcap")
+
+
+@pytest.mark.parametrize(
+    "objects", [struct.pack("<4sHHLL", b"LOBJ", 16, 1, 0, 1).ljust(99), bytes(1 << 25)], ids=["no length", "bomb"]
+)
+def test_objects_without_a_length_and_bombs_end_a_blf_file(objects: bytes, tmp_path: Path) -> None:
+    can = pytest.importorskip("can")
+    path = tmp_path / "a.blf"
+    with can.BLFWriter(path) as writer:
+        writer.on_message_received(can.Message(timestamp=T0 / 1e9, data=b"1"))
+    packed = struct.pack("<H6xL4x", 2, len(objects)) + zlib.compress(objects)
+    head = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(packed), 10)
+    path.write_bytes(path.read_bytes() + head + packed)
+    result = convert(path, tmp_path / "a.mcap")
+    assert (result.messages, [each[:40] for each in result.losses]) == (
+        {"can0/frames": 1},
+        ["rest of the file, which can't be read (V"],
+    )
+
+
+@pytest.mark.parametrize("text", ["[" * 3000, "rosbag2_bagfile_information: [1]", "names: .."])
+def test_metadata_of_ros2_that_makes_no_sense(text: str, tmp_path: Path) -> None:
+    convert(write(tmp_path / "a.mcap", leds(3)), tmp_path / "drive")
+    file = tmp_path / "drive" / "metadata.yaml"
+    file.write_text(file.read_text().replace("drive_0.mcap", "..") if text == "names: .." else text)
+    with pytest.raises(r2p.BagError):
+        convert(tmp_path / "drive", tmp_path / "out.mcap")
