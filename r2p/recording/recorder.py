@@ -202,7 +202,7 @@ class Recorder:
 
     def _report(self, text: str) -> None:
         """Log what the writer reports: a limit that the program has set is no fault."""
-        logger.log(logging.INFO if self.stopped.startswith("max_") else logging.WARNING, "%s", text)
+        logger.log(logging.DEBUG if self.stopped.startswith("max_") else logging.WARNING, "%s", text)
 
     # The beginning and the end
 

@@ -107,7 +107,7 @@ def _virtual_clock() -> VirtualClock:
     """Return the clock of the running loop. Raises Error without virtual time."""
     clock = clock_of(asyncio.get_running_loop())
     if not isinstance(clock, VirtualClock) or clock.paced:
-        raise Error("a recording is played to a test under virtual time: mark the test with @pytest.mark.virtual_time")
+        raise Error("play() needs virtual time: mark the test with @pytest.mark.virtual_time, or use r2p.sim.run()")
     return clock
 
 

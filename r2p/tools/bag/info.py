@@ -41,7 +41,11 @@ async def info(
         for line in _head(record):
             await output.remark(line)
         topics = [each | {"rate": each["rate"] and f"{each['rate']:g} Hz"} for each in topics]
-        for rows, columns in ((topics, _TOPIC_COLUMNS), (channels, _CHANNEL_COLUMNS), (losses, _LOSS_COLUMNS)):
+        for rows, columns in (
+            (topics, _TOPIC_COLUMNS),
+            (_joined(channels), _CHANNEL_COLUMNS),
+            (losses, _LOSS_COLUMNS),
+        ):
             if rows:
                 await output.remark("")
                 await output.table(rows, columns)
@@ -131,6 +135,7 @@ def _topic(bag: "Bag", name: str, channels: "list[BagChannel]", ids: list[dict[o
     infos = [each.info for each in channels if each.info]
     count = sum(each.count for each in channels)
     publishers = {f"{each.module or '?'}/{each.node}" if each.node else each.module for each in infos}
+    publishers -= {each.module for each in infos if each.node}  # the same one, before its node was known
     return {
         "topic": name,
         "type": " ".join(sorted({each.type_name for each in channels if each.type_name})) or None,
@@ -169,6 +174,21 @@ def _channels(bag: "Bag") -> list[dict[str, Any]]:
         if each.kind == "messages":
             counts[each.name, each.type_name or each.encoding] += each.count
     return [{"channel": name, "type": kind, "count": count} for (name, kind), count in sorted(counts.items())]
+
+
+def _joined(channels: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows for a terminal, with one for all parts of the load of a bus: a robot has dozens of these."""
+    from r2p.recording.messages import BUS_LOADS
+
+    rows: dict[str, dict[str, Any]] = {}
+    for each in channels:
+        name = each["channel"]
+        parts = name.removeprefix(f"{BUS_LOADS}/").split("/")
+        if name.startswith(f"{BUS_LOADS}/") and len(parts) > 1 and f"{BUS_LOADS}/{parts[0]}" in rows:
+            name = f"{BUS_LOADS}/{parts[0]}/*"
+        row = rows.setdefault(name, {**each, "channel": name, "count": 0})
+        row["count"] += each["count"]
+    return list(rows.values())
 
 
 # What was lost

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -25,7 +26,6 @@ from tests.tools.rig import PUBLISH, VIA, listening, printed, process, robot, to
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
-    from pathlib import Path
 
     import r2p
 
@@ -167,7 +167,9 @@ def test_a_process_ends_its_file_and_writes_snapshots_at_signals(tmp_path: Path)
         ({"all": True, "type": ["Led"]}, "write it as TOPIC=TYPE"),
         ({"all": True, "type": ["leds=Lead"]}, "no message class 'Lead'"),
         ({"frames": True}, "give --via rtcan:can0"),
-        ({"all": True, "split": True}, "split needs"),
+        ({"all": True, "split": True}, "--split needs a --max-size"),
+        ({"all": True, "max_total": 9}, "--max-total deletes .*: it needs --split"),
+        ({"all": True, "output": Path("leds.bag")}, "r2p bag convert makes .bag of it"),
     ],
 )
 def test_what_makes_no_sense_is_refused(given: dict[str, Any], error: str) -> None:

@@ -8,8 +8,18 @@ import pytest
 
 import r2p
 from r2p.messages import Message
+from r2p.msg import BusTraffic
 from r2p.recording.entries import EntryWriter, MessageEntry
-from r2p.recording.messages import EVENTS, LOSSES, SIGNALS, RecordedEvent, RecordedSignal, RecorderLosses, TopicLosses
+from r2p.recording.messages import (
+    BUS_LOADS,
+    EVENTS,
+    LOSSES,
+    SIGNALS,
+    RecordedEvent,
+    RecordedSignal,
+    RecorderLosses,
+    TopicLosses,
+)
 from r2p.recording.writer import BagWriter
 from r2p.tools import main
 from r2p.tools.bag.echo import echo
@@ -93,6 +103,20 @@ async def test_info_at_a_terminal(
     assert lines[-2:] == [
         "TOPIC  TYPE          COUNT  RATE     PUBLISHERS  CLASS  LINK",
         "leds   r2p_msgs/Led  9      1000 Hz  IMU/leds    nrt    tcp",
+    ]
+
+
+@pytest.mark.anyio
+async def test_info_at_a_terminal_joins_the_parts_of_a_load(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    names = ("sim:a", "sim:a/hrt/speed/MOTOR1", "sim:a/nrt/log/PS", "sim:b")
+    await info(observed(tmp_path / "drive.mcap", [(f"{BUS_LOADS}/{each}", BusTraffic()) for each in names]))
+    assert capsys.readouterr().out.splitlines()[-3:] == [
+        "/r2p/bus_load/sim:a    r2p_msgs/BusTraffic  1",
+        "/r2p/bus_load/sim:a/*  r2p_msgs/BusTraffic  2",
+        "/r2p/bus_load/sim:b    r2p_msgs/BusTraffic  1",
     ]
 
 
