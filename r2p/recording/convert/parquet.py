@@ -33,7 +33,8 @@ from r2p.recording.format import ChannelInfo
 from r2p.recording.types import schema_of, type_of
 
 _SUFFIX = ".parquet"
-_ROWS = 8192  # of a group, which are held in memory
+_ROWS = 8192  # of a group, which are held in memory, if they have less than _HELD_MAX
+_HELD_MAX = 32 << 20  # bytes of messages
 _READ_ROWS = 1024
 _TYPE, _SCHEMA, _DEFINITION = b"r2p.type", b"r2p.schema", b"r2p.definition"
 _TIME = pa.timestamp("ns", tz="UTC")
@@ -109,6 +110,7 @@ class ArrowTable(Table):
         self._schema = pa.schema([*_CONTEXT, *own], metadata=_metadata(cls))
         self._writer = pq.ParquetWriter(path, self._schema)
         self._columns: list[list[Any]] = [[] for _ in self._schema]
+        self._held = 0  # bytes of the messages in them
 
     def add(self, record: ConvertedRecord, message: Message | None) -> str:
         context = context_of(record)
@@ -119,7 +121,8 @@ class ArrowTable(Table):
             values = [record.sample.data]
         for column, value in zip(self._columns, [*context, *values], strict=True):
             column.append(value)
-        if len(self._columns[0]) >= _ROWS:
+        self._held += len(record.sample.data)
+        if len(self._columns[0]) >= _ROWS or self._held >= _HELD_MAX:
             self.finish()
         return ""
 
@@ -128,6 +131,7 @@ class ArrowTable(Table):
         arrays = [pa.array(column, each.type) for column, each in zip(self._columns, self._schema, strict=True)]
         self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
         self._columns = [[] for _ in self._schema]
+        self._held = 0
 
     def close(self) -> None:
         self._writer.close()

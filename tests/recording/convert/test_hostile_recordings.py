@@ -97,3 +97,13 @@ def test_metadata_of_ros2_that_makes_no_sense(text: str, tmp_path: Path) -> None
     file.write_text(file.read_text().replace("drive_0.mcap", "..") if text == "names: .." else text)
     with pytest.raises(r2p.BagError):
         convert(tmp_path / "drive", tmp_path / "out.mcap")
+
+
+def test_long_messages_are_not_all_held_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parquet = pytest.importorskip("r2p.recording.convert.parquet")
+    monkeypatch.setattr(parquet, "_HELD_MAX", 20)
+    convert(write(tmp_path / "a.mcap", leds(30)), tmp_path / "leds.parquet")
+    assert parquet.pq.ParquetFile(tmp_path / "leds.parquet").num_row_groups == 8  # of 5 bytes each
+    convert(tmp_path / "leds.parquet", tmp_path / "back.mcap")
+    with Bag(tmp_path / "back.mcap") as bag:
+        assert len(list(bag.samples("leds"))) == 30
