@@ -23,7 +23,7 @@ File = Annotated[
         metavar="FILE", help="A recording, a directory of its parts, or a pattern: 'drive-*.mcap'.", show_default=False
     ),
 ]
-Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings, as above.", show_default=False)]
+Files = Annotated[list[Path], typer.Argument(metavar="FILE", help="Recordings, two or more.", show_default=False)]
 Topics = Annotated[
     list[str] | None,
     typer.Option("--topics", metavar="PATTERN", help="Only these: odometry, 'camera/*', /can0/frames (repeatable)."),
