@@ -1,6 +1,7 @@
 """MCAP files: our own recordings, and those of others with messages of ROS 1 or ROS 2."""
 
 import heapq
+import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -14,13 +15,14 @@ from r2p.recording.channels import BagChannel
 from r2p.recording.convert.ros_messages import RosDecoder, ros_decoder
 from r2p.recording.convert.stream import ConversionOptions, ConvertedItem, ConvertedRecord, Losses, RecordSink
 from r2p.recording.entries import MetadataEntry
-from r2p.recording.format import CDR, ROS2MSG
+from r2p.recording.format import CDR, OWN_PREFIX, ROS2MSG
 from r2p.recording.samples import SampleWriter
 from r2p.recording.types import schema_of
 from r2p.recording.writer import BagWriter
 from r2p.ros.transcoding import transcoder
 from r2p.runtime.sample import Sample, Source
 
+_FORBIDDEN = re.compile(r"[^A-Za-z0-9_/]")  # in names: /r2p/bus_load/rtcan:can0 has such
 _VERSIONS = {("ros1", "ros1msg"): 1, (CDR, ROS2MSG): 2}
 """The version of ROS by the encodings of a channel and its schema."""
 
@@ -89,7 +91,8 @@ def _channel(channel: BagChannel) -> _ReadChannel | str:
     if version is None:
         return f"messages of {channel.name}, encoded as {channel.encoding or 'nothing'}, not as cdr or ros1"
     try:
-        topic = topic_name(channel.name)
+        name = channel.name
+        topic = topic_name(_FORBIDDEN.sub("_", name) if name.startswith(OWN_PREFIX) else name)
         decoder = ros_decoder(channel.schema_name, version, channel.schema.decode("utf-8", "replace"))
     except (InvalidName, MessageError) as error:
         return f"messages of {channel.name}: {error}"

@@ -16,10 +16,11 @@ from rosbags.typesys import Stores, get_typestore
 import r2p
 from r2p.codecs.can_bits import LOCAL, WireFrame
 from r2p.messages import Message, layout
-from r2p.msg import Led, Odometry, Pose3, Velocity3
+from r2p.msg import BusTraffic, Led, Odometry, Pose3, Velocity3
 from r2p.recording.bag import Bag
 from r2p.recording.convert.formats import convert, target_format
 from r2p.recording.convert.stream import ConversionOptions
+from r2p.recording.entries import EntryWriter, MessageEntry
 from r2p.recording.format import LATCHED, META_PREFIX
 from r2p.recording.frames import BusInfo, FrameEntry, FrameWriter
 from r2p.recording.samples import SampleWriter
@@ -102,6 +103,16 @@ def test_frames_and_events_keep_their_channels(tmp_path: Path) -> None:
         .splitlines()[1]
         .endswith(",can0,291,False,False,False,3,97,98,99,0,0,0,0,0")
     )
+
+
+def test_channels_that_are_named_after_buses_are_converted(tmp_path: Path) -> None:
+    with (tmp_path / "drive.mcap").open("wb") as file:
+        writer = BagWriter(file)
+        EntryWriter(writer).write(MessageEntry("/r2p/bus_load/rtcan:can0/management/R2P/?", BusTraffic(), START))
+        writer.finish()
+    result = convert(tmp_path / "drive.mcap", tmp_path / "drive")
+    assert result.messages == {"r2p/bus_load/rtcan_can0/management/R2P/_": 1}
+    assert not result.losses
 
 
 def all_records(path: Path) -> list[Any]:
