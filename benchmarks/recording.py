@@ -23,6 +23,7 @@ from r2p.recording.format import CDR, PROFILE, ROS2MSG
 from r2p.recording.recorder import Recorder
 from r2p.recording.types import schema_of
 from r2p.ros.cdr import cdr
+from r2p.tools.bag.record import lower_priority
 from r2p.transports.tcp import TcpListenTransport
 from r2p.transports.url import parse
 
@@ -154,6 +155,7 @@ async def _second(pipe: Connection, port: int, path: Path | None) -> None:
     names = [f"topic{number}" for number in range(TOPICS)]
     async with r2p.Module("SECOND", via=zenoh.connect(port), watchdog=False) as module:
         if path is not None:
+            lower_priority()  # as `r2p bag record`
             async with Recorder(module, path, names, types=dict.fromkeys(names, Sent)):
                 pipe.send("ready")
                 await asyncio.to_thread(pipe.recv)

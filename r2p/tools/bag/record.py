@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import functools
 import logging
+import os
 import re
 import signal
 from collections.abc import Callable, Iterator, Mapping
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
 
 SNAPSHOT_SERVICE = "bag/snapshot"
 """The service, of type std_srvs/Trigger, that writes the last seconds into a file."""
+
+_NICENESS = 5
+"""The priority of the process for the operating system: 0 is that of others, 19 the lowest."""
 
 _MIN_FREE = 1_000_000_000  # bytes
 _ANSWER_MAX = 160  # characters of an answer to that service, which all links carry
@@ -161,7 +165,17 @@ async def record(
         options=_options(dict(zip(_LIMITS, limits, strict=True))),
         parts=_parts(session.settings, buses if frames else None, events=not no_events),
     )
+    if not session.module.space.clock.virtual:
+        lower_priority()
     await _record(session, recorder, Output(format), topics or [], buses)
+
+
+def lower_priority() -> None:
+    """Let other processes go first, such as those of the robot's nodes, in all threads of this one."""
+    threads = Path("/proc/self/task")
+    for thread in [int(each.name) for each in threads.iterdir()] if threads.exists() else [0]:
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            os.setpriority(os.PRIO_PROCESS, thread, max(_NICENESS, os.getpriority(os.PRIO_PROCESS, thread)))
 
 
 async def _record(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -146,6 +147,8 @@ def test_a_process_ends_its_file_and_writes_snapshots_at_signals(tmp_path: Path)
         with process(*arguments, "--snapshot", "1m", "--min-free", "0") as child:
             assert child.stderr is not None
             assert "keeping the last seconds" in child.stderr.readline()
+            priority = os.getpriority(os.PRIO_PROCESS, child.pid)
+            assert priority == max(5, os.getpriority(os.PRIO_PROCESS, 0))
             child.send_signal(signal.SIGUSR1)
             assert f"snapshot: {tmp_path}/one-0001.mcap" in child.stderr.readline()
             child.send_signal(signal.SIGHUP)  # the terminal is closed
