@@ -28,7 +28,7 @@ right before a block are notes, `<!-- key -->` or `<!-- key: value -->`:
 A block that consists of `--8<-- "FILE"` shows a file, which has tests of its own, and is not seen here.
 
 In what a block prints, `...` stands for any text in a line, and alone in a line for any lines; columns may be wider,
-and where a machine is slow, a command may say what it waits for.
+and where a machine is slow, a command may say what it waits for, such as a program that does not listen yet.
 """
 
 import re
@@ -48,7 +48,7 @@ _FENCE = re.compile(
 )
 _NOTES = re.compile(r"(?:^ *<!-- [^\n]* -->\n+)+\Z", re.MULTILINE)
 _NOTE = re.compile(r"<!-- ([a-z ]+)(?:: (.*))? -->")
-_WAITING = "(?:r2p: waiting for .*\n)*"
+_WAITING = "(?:r2p: (?:waiting for .*|warning: link .*: Connection refused: .*)\n)*"
 _TITLE = re.compile(r'title="([^"]+)"')
 _FILE = re.compile(r'\s*--8<-- "[^"\n]*"\s*')
 

@@ -26,7 +26,7 @@ from r2p.tools.session import Settings, UsageError, join
 from tests.tools.rig import PUBLISH, VIA, listening, printed, process, robot, tool
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterator
 
     import r2p
 
@@ -139,7 +139,16 @@ async def test_a_service_writes_the_last_seconds(tmp_path: Path) -> None:
     assert 8 <= len(values(tmp_path / "last-0001.mcap")) <= 20
 
 
+@pytest.fixture
+def hangup_ends() -> Iterator[None]:
+    """Processes that are started now end at SIGHUP, also if the tests were started with `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.processes
+@pytest.mark.usefixtures("hangup_ends")
 def test_a_process_ends_its_file_and_writes_snapshots_at_signals(tmp_path: Path) -> None:
     path = tmp_path / "one.mcap"
     with process(*PUBLISH) as robot:
