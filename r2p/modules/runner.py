@@ -126,7 +126,7 @@ def _print_shortly(error: Exception, *, one_line: bool) -> None:
     if sys.excepthook is sys.__excepthook__ and not debugging():
         sys.excepthook = _excepthook
     with contextlib.suppress(AttributeError):  # of this error only: others are the program's
-        error.__r2p_one_line__ = one_line  # type: ignore[attr-defined]
+        error.__r2p_one_line__ = one_line  # type: ignore[attr-defined]  # `_excepthook` reads it
 
 
 def _excepthook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -95,7 +95,7 @@ class BackgroundWriter:
         return self._put_bytes - self._done_bytes
 
     def put(self, entries: list[BagEntry]) -> None:
-        """Hand entries over, in a list that the caller no longer uses. Never waits: drops what does not fit the queue.
+        """Take over a list of entries without waiting. Entries that do not fit the queue are dropped and counted.
 
         Does nothing after `close`.
         """

@@ -68,7 +68,7 @@ class RawMessage(msgspec.Struct, frozen=True, gc=False):
 
 
 def is_of(topics: Collection[str] | None, kinds: Collection[str]) -> Callable[[BagChannel], bool]:
-    """Return a function that says whether a channel is of these topics (None: all) and of one of these kinds."""
+    """Return a predicate for channels: True for those of these topics (None: all) and of one of these kinds."""
     names = None if topics is None else {each.removeprefix("/") for each in topics}
     return lambda each: each.info is not None and each.kind in kinds and (names is None or each.info.topic in names)
 
@@ -376,7 +376,7 @@ class Bag:
     def _read(
         self, number: int, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int
     ) -> list[MessageRecord]:
-        """Return the messages of a chunk; none if it can't be read, which is counted."""
+        """Return the messages of a chunk. A damaged chunk is counted, and has an empty list."""
         try:
             return self.files[number].messages(chunk, ids, start, end)
         except BagError as error:

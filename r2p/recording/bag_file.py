@@ -84,14 +84,14 @@ class BagFile:
             yield Attachment(record.name, record.media_type, record.data, record.log_time)
 
     def messages(self, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int) -> list[MessageRecord]:
-        """Return the messages of a chunk: those of the channels `ids`, which the file has; None: of all that it has.
+        """Return the messages of a chunk on the channels `ids`; None: on all channels of the file.
 
         Raises BagError if the chunk can't be read.
         """
         return messages(self.file.chunk(chunk), self.channels if ids is None else ids, start, end)
 
     def times(self, chunk: ChunkRef) -> list[tuple[int, int]]:
-        """Return the log times in a chunk with their channels; none if it can't be read. The last chunks are kept."""
+        """Return the log times in a chunk with their channels; none for a damaged one. The last chunks are cached."""
         if chunk.offset not in self._times:
             try:
                 found = [message[:2] for message in self.messages(chunk, None, 0, TIME_MAX + 1)]

@@ -81,7 +81,7 @@ class BusWatch:
             self._write(table)
 
     def note_master(self, link: str, kind: str, text: str) -> None:
-        """Record that a bus has a master, or none (`kind`)."""
+        """Record a change of a bus's master; `kind` names the change."""
         module = "" if kind == "no master" else next((each.master for each in self._links() if each.name == link), "")
         self._masters[link] = module
         self._record(EVENTS, RecordedEvent(kind=kind, link=cut(link), module=cut(module), text=cut(text, TEXT_MAX)))

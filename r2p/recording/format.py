@@ -100,7 +100,7 @@ class ChannelInfo(msgspec.Struct, frozen=True):
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> Self | None:
-        """Return what the metadata of a channel says; None for a channel that is not of this kind.
+        """Parse the metadata of a channel; return None for a channel that is not of this kind.
 
         Raises DecodeError for a class of publishers that is unknown here.
         """

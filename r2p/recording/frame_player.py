@@ -142,7 +142,7 @@ class FramePlayer:
         return await open_sender(interface if colon else "socketcan", channel if colon else interface, options.bitrate)
 
     async def _hear(self) -> str:
-        """Return which RTCAN is spoken on the bus; empty for none."""
+        """Return a description of the RTCAN traffic on the bus; empty for a bus without RTCAN."""
         if self._simulated is None:
             async with BusMonitor(self._via) as monitor:
                 return await _rtcan_on(monitor)

@@ -135,7 +135,7 @@ class BusReader:
 
 
 def observe(monitor: Monitor, frame: RecordedFrame) -> SeenFrame | None:
-    """Let a monitor see a frame. Return what it makes of it; None of an error frame, which it counts."""
+    """Pass a frame to a monitor, and return its description; None for an error frame, which the monitor counts."""
     if frame.error:
         for kind in errors_in(frame):
             monitor.fault(kind)

@@ -218,7 +218,7 @@ class _RecordedInterface:
 
 
 class _ObservedBus:
-    """An observer of a simulated bus, which is no node of it."""
+    """An observer of a simulated bus. It is not a node on it, so it acknowledges no frames."""
 
     def __init__(self, can: SimCan, recorder: FrameRecorder) -> None:
         self._bus = can.bus

@@ -113,7 +113,7 @@ class BusInfo(msgspec.Struct, frozen=True):
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> Self | None:
-        """Return what the metadata of a channel says; None for a channel of another program.
+        """Parse the metadata of a channel; return None for a channel of another program.
 
         Raises DecodeError for a number that can't be.
         """

@@ -37,7 +37,7 @@ class LogWatch:
             tasks.create_task(self._follow(topic), name=f"recorder follows {topic}")
 
     def close(self) -> None:
-        """Subscribe no longer."""
+        """End the subscription."""
         self._node.close()
 
     async def _follow(self, topic: str) -> None:

@@ -1,4 +1,4 @@
-"""The records of an MCAP file, read without trust in its numbers: each length is compared with what there is.
+"""The records of an MCAP file, read without trust in its numbers: each length is checked against the size of the file.
 
 A file may be cut, damaged or hostile. What can't be read raises BagError, and nothing is allocated for a number that
 stands in the file: records are never longer than the rest of the file, and chunks unpack to CHUNK_MAX bytes at most.
@@ -208,7 +208,7 @@ def _decompressed(compression: str, packed: memoryview, size: int) -> bytes:
 
 
 def _reader(compression: str, packed: bytes | memoryview) -> Callable[[int], bytes]:
-    """Return a function that unpacks up to so many more bytes: none at the end, or where the data are cut.
+    """Return a function that unpacks up to so many further bytes; it returns empty bytes at the end, or at a cut.
 
     Raises ValueError for an unknown compression.
     """

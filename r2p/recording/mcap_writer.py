@@ -197,7 +197,7 @@ class McapWriter:
 
     @property
     def has_messages(self) -> bool:
-        """Whether there is a chunk."""
+        """Whether the file has a chunk."""
         return bool(self._counts)
 
     def finish(self) -> None:
@@ -247,7 +247,7 @@ class McapWriter:
         return min((item.start for item in chunks), default=0), max((item.end for item in chunks), default=0)
 
     def drop_last_chunk(self) -> PackedChunk | None:
-        """Cut the last chunk off, to make room for the summary, and all behind it; return it, None if there is none."""
+        """Truncate the file before its last chunk to make room for the summary. Return the chunk, None without one."""
         while self._written:
             item = self._written.pop()
             chunk = self._read_back(item.position) if item.opcode == Opcode.CHUNK_INDEX else None

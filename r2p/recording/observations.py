@@ -191,7 +191,7 @@ class Observations:
                 self._record(EVENTS, RecordedEvent(kind="module silent", module=cut(view.name), text=text))
 
     def _watch_modules(self, tasks: asyncio.TaskGroup) -> None:
-        """Ask modules that are new, and no longer those that are gone."""
+        """Begin to ask new modules, and stop asking those that have left."""
         names = {view.name for view in self._module.network.modules() if _answers(view)}
         for name in sorted(self._watches.keys() - names):
             watch, task = self._watches.pop(name)

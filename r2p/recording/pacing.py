@@ -211,7 +211,7 @@ class PacedStream(Generic[T]):
 
     @property
     def next_time(self) -> int | None:
-        """The time of the next record; None if it has not been read, or there is none."""
+        """The time of the next record; None before it is read, and at the end."""
         return self._batch[0][0] if self._refill() else None
 
     def play_next(self) -> None:
@@ -258,7 +258,7 @@ class PacedStream(Generic[T]):
         return True
 
     def _refill(self) -> bool:
-        """Return whether there is a record to play."""
+        """Return whether a record is left to play."""
         if not self._batch and self._reader is not None:
             self._batch = self._reader.take()
         return bool(self._batch)
@@ -318,11 +318,11 @@ class _RecordReader(abc.ABC, Generic[T]):
 
     @abc.abstractmethod
     async def first(self) -> None:
-        """Wait until the first records are read. Raises what reading raises, if there are none."""
+        """Wait until the first records are read. Raises the error of the reader if it fails before the first one."""
 
     @abc.abstractmethod
     def take(self) -> deque[tuple[int, T]]:
-        """Return the next records; none if there are none yet, or no more."""
+        """Return the next records; an empty list while they are being read, and at the end."""
 
     def close(self) -> None:
         """Stop reading."""

@@ -87,7 +87,7 @@ class PlayedPublisher:
             sink.offer_latched(self._last)
 
     def link_degraded(self, link: str, reason: str) -> None:
-        """Note that a link no longer carries the topic: the log of the link has it."""
+        """Ignore the loss of a link: the link logs it itself."""
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
         """Count a message that a link gave up."""

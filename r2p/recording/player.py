@@ -129,8 +129,10 @@ class Player:
     """
 
     def __init__(self, module: Module, bag: Bag, options: PlayOptions = PlayOptions()) -> None:  # noqa: B008 - frozen
-        """Choose the topics. Raises BagError if there is nothing to play, InvalidName and NameTooLong for the names in
-        `remap`, and MessageError for a rate that is out of range.
+        """Choose the topics.
+
+        Raises BagError for a choice without messages, InvalidName and NameTooLong for the names in `remap`, and
+        MessageError for a rate that is out of range.
         """
         self.topics: dict[str, PlayedTopic] = {}
         """The topics by their names here."""

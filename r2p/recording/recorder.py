@@ -148,7 +148,7 @@ class Recorder:
 
     @property
     def keeps(self) -> bool:
-        """Whether the recorder keeps the last seconds in memory, for snapshots, and writes nothing else."""
+        """Whether the recorder only keeps the last seconds in memory, and writes them as snapshots."""
         return self._options.snapshot > 0.0
 
     @property
@@ -201,7 +201,7 @@ class Recorder:
         return self._writer
 
     def _report(self, text: str) -> None:
-        """Log what the writer reports: a limit that the program has set is no fault."""
+        """Log a report of the writer: as a warning, unless a limit that the program has set ended the recording."""
         logger.log(logging.DEBUG if self.stopped.startswith("max_") else logging.WARNING, "%s", text)
 
     # The beginning and the end

@@ -31,7 +31,7 @@ _FILES_OF_TOTAL: Final = 10  # files that share max_total, where nothing else sa
 
 
 class RecordingOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How a recording is written: sizes in bytes, times in seconds; 0 is no limit.
+    """Options for the files of a recording. Sizes are in bytes, times in seconds; 0 turns a limit off.
 
     The recording ends at `max_size` or `max_duration`; with `split`, another file begins there. `max_total` is for all
     files: the oldest are deleted, and so they are when the disk is full. With less than `min_free` on the disk the
@@ -85,7 +85,7 @@ class BackgroundSync:
         self._thread.start()
 
     def join(self) -> None:
-        """Wait until the file is no longer used, and raise the OSError of the last time."""
+        """Wait for the running synchronisation, and raise its OSError, if any."""
         if self._thread is not None:
             self._thread.join()
         self._thread = None
@@ -285,7 +285,7 @@ class RecordingFiles:
                 self._on_error(error)
 
     def _open(self) -> None:
-        """Create the next file. Raises OSError; then there is none."""
+        """Create the next file. Raises OSError, and leaves no file behind then."""
         path, raw = self._create()
         try:
             file = McapWriter(raw)
@@ -319,7 +319,7 @@ class RecordingFiles:
         return self.path.with_stem(f"{self.path.stem}-{self._number:04}") if self._numbered else self.path
 
     def _finish_file(self) -> None:
-        """Write the summary; if there is no room for it, in place of the last chunks."""
+        """Write the summary, in place of the last chunks if the disk has no room for it."""
         raw, file = self._raw, self._file
         self._raw = self._file = None
         if raw is None or file is None:
@@ -360,7 +360,7 @@ class RecordingFiles:
             self._give_up(file.drop_last_chunk())
 
     def _give_up(self, chunk: PackedChunk | None) -> None:
-        """Leave a chunk, which made room for the end of its file, to the next file; if there is none, it is lost."""
+        """Move a chunk that made room for the end of its file to the next file; without one its messages are lost."""
         if chunk is None:
             return
         if self._options.split and not self.stopped:
@@ -399,7 +399,7 @@ class RecordingFiles:
                 pass
 
     def fail(self, why: str) -> None:
-        """End the recording with a file that can be read, as nothing more can be written."""
+        """End the recording after an error of the disk, with a complete file."""
         self.stopped, self._failed = why, True
         self.writer.end_chunk()
         lost = sum(self._count_lost(item) for item in self.writer.ready if isinstance(item, PackedChunk))
@@ -440,7 +440,7 @@ class RecordingFiles:
                 self._ring_size -= self._ring.popleft().size
 
     def snapshot(self) -> Path:
-        """Write what is in memory into a new file. Raises OSError; then there is no file."""
+        """Write the messages in memory into a new file. Raises OSError, and leaves no file behind then."""
         self.writer.end_chunk()
         self._keep()
         self._open()

@@ -67,7 +67,7 @@ class RecoveryReport(msgspec.Struct):
 
 
 def recover(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> RecoveryReport:
-    """Write what can be read of a recording into a new file; there is none if the recording is complete.
+    """Write the readable messages of a recording into a new file, unless the recording is complete.
 
     Raises BagError if the source can't be opened or is not an MCAP file, FileExistsError for a target that is there
     already, OSError.
@@ -80,7 +80,10 @@ def recover(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> R
 def recover_in_steps(
     source: str | os.PathLike[str], target: str | os.PathLike[str]
 ) -> Generator[RecoveryReport, None, None]:
-    """Do the same in steps, and yield the report of each; if it is closed before its end, there is no new file."""
+    """Recover in steps, as `recover` does, and yield the report after each.
+
+    Closing the iterator early deletes the new file.
+    """
     path, complete = Path(target), False
     with contextlib.closing(McapReader(Path(source))) as file, path.open("xb") as new:
         try:
@@ -133,7 +136,7 @@ class RecordingRecovery:
             return ""  # counted when its turn comes
 
     def _read_summary(self) -> None:
-        """Begin the channels that the summary names, if there is one: the records of some may be damaged."""
+        """Begin the channels of the summary, in case the records of some are damaged."""
         footer = self._whole_record(self._source.size - len(MAGIC) - _FOOTER_BODY - RECORD_HEAD.size)
         if footer is None or footer[0] != Opcode.FOOTER:
             return
@@ -184,7 +187,7 @@ class RecordingRecovery:
         return end
 
     def _next_chunk(self, position: int) -> int:
-        """Return where something begins that looks like a chunk; the end of the file if there is none."""
+        """Return the offset of the next bytes that look like a chunk; without any, the end of the file."""
         while position < self._source.size:
             at = _find_chunk(self._read(position, _PIECE + _OVERLAP))
             if at is not None:
@@ -193,7 +196,7 @@ class RecordingRecovery:
         return self._source.size
 
     def _read(self, position: int, length: int) -> bytes:
-        """Return what can be read of these bytes: nothing where the disk has an error."""
+        """Read these bytes of the file; return empty bytes after an error of the disk."""
         try:
             return self._source.read(position, min(length, self._source.size - position))
         except BagError:

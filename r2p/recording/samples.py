@@ -89,7 +89,7 @@ class _SampleChannel(msgspec.Struct, eq=False):
 
 
 def _typed(info: ChannelInfo, cls: type[Message]) -> tuple[ChannelInfo, Ros2Schema | None]:
-    """Return what a channel says of its type, and its schema; None if its messages are written packed.
+    """Return the channel's metadata with its type, and its schema; None for messages that are written packed.
 
     These are messages of classes that ROS can't define, and of those that can't be made again of what the file says of
     them. If not even the layout says it, as it is too long, the type is unknown.

@@ -103,7 +103,7 @@ def _footer(file: McapReader) -> Footer | None:
 
 
 def _from_section(file: McapReader, footer: Footer) -> Summary | None:
-    """Return what the summary section says; None if that is less than a walk finds."""
+    """Parse the summary section; return None if a walk through the file would find more."""
     length = file.size - len(MAGIC) - footer.summary_start
     if length > _SECTION_MAX:
         raise BagError("the summary is too long")

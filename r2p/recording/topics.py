@@ -140,7 +140,7 @@ class RecordedTopic:
         return self._subscriber.lost + self._subscriber.too_long
 
     def _handle(self, sample: Sample) -> None:
-        """Record a message: called by `Topic.deliver` with each one, so there is little here."""
+        """Record a message. `Topic.deliver` calls this with each one, so it is short."""
         publisher = self._last
         if (
             publisher is None

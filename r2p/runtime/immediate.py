@@ -19,7 +19,7 @@ class _HandledAtOnce(deque[Sample]):
 
     def __init__(self, handle: Callable[[Sample], None]) -> None:
         super().__init__()
-        self.append = handle  # type: ignore[method-assign]
+        self.append = handle  # type: ignore[method-assign]  # links append without a call of ours in between
 
 
 class ImmediateSubscriber(SubscriberQueue):

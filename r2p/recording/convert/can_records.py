@@ -1,4 +1,4 @@
-"""CAN frames as records of a conversion, for all formats that have nothing but frames."""
+"""CAN frames as records of a conversion, for all formats that hold only frames."""
 
 import abc
 
@@ -26,7 +26,7 @@ class FrameRecords:
         self._counts: dict[str, int] = {}
 
     def record(self, frame: RecordedFrame) -> ConvertedRecord | None:
-        """Return the record of a frame; None if it is not wanted, or can't be."""
+        """Return the record of a frame; None for a frame outside of the options, or one that a bag can't hold."""
         bus = BusInfo(frame.bus)
         topic = bus.topic.removeprefix("/")
         if not 0 <= frame.time < _END:

@@ -43,7 +43,7 @@ def read(path: Path, options: ConversionOptions, losses: Losses) -> Iterator[Con
 
 
 def parse(line: str) -> RecordedFrame | str:
-    """Return the frame in a line, or in words what it is instead; nothing for an empty line."""
+    """Return the frame in a line, or a description of another line; an empty text for an empty line."""
     match = _LINE.fullmatch(line.rstrip("\r\n"))
     if match is None:
         return "" if not line.strip() else "frames of CAN FD" if _FD.match(line) else "lines that are not frames"

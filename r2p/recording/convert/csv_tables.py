@@ -72,7 +72,7 @@ def _packer(topic: str, path: Path, columns: Any, cls: type[Message] | None) -> 
 
 
 def _value(shape: Shape, path: str, row: Mapping[str, Any]) -> Any:
-    """Return the value of a field as `from_plain` takes it, from the cells below its path; None if there are none."""
+    """Return the value of a field as `from_plain` takes it, from the cells below its path; None without such cells."""
     match shape:
         case Nested(inner):
             prefix = f"{path}." if path else ""

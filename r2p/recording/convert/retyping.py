@@ -25,7 +25,10 @@ class Retyping:
         self._changes: dict[tuple[str, type[Message] | None], _Change] = {}
 
     def __call__(self, record: ConvertedRecord) -> Iterable[ConvertedRecord]:
-        """Return what becomes of a message: one, several, or none, which is counted. Raises BagError."""
+        """Return the messages that take the place of one: the same, converted ones, or none for a lost one.
+
+        A lost message is counted. Raises BagError.
+        """
         key = record.topic, record.cls
         change = self._changes.get(key)
         if change is None:

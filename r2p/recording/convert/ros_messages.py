@@ -24,8 +24,8 @@ from r2p.runtime.sample import Sample, Source
 
 
 class RosDecoder(msgspec.Struct, frozen=True):
-    """What reads the messages of one type of ROS 1 or 2. Calling it returns a message as r2p packs it, and its own
-    stamp (UTC, ns; 0: none); it raises DecodeError.
+    """Decodes the messages of one type of ROS 1 or 2. A call returns the message as r2p packs it, and its own stamp
+    (UTC, ns; 0: no stamp), and raises DecodeError.
     """
 
     cls: type[Message]
@@ -77,8 +77,18 @@ class RosSchema(msgspec.Struct, frozen=True):
     checksum: str
 
 
+def schema_or_loss(record: ConvertedRecord, version: int) -> RosSchema | str:
+    """Return the schema of a record's type in ROS 1 or 2; without one, the description of its loss."""
+    if record.cls is None:
+        return f"messages of {record.topic}, whose type is unknown: --type {record.topic}=TYPE states it"
+    try:
+        return _ros_schema(record.cls, version)
+    except MessageError as error:
+        return f"messages of {record.topic}: {error}"
+
+
 @functools.lru_cache(maxsize=1024)
-def ros_schema(cls: type[Message], version: int) -> RosSchema:
+def _ros_schema(cls: type[Message], version: int) -> RosSchema:
     """Return the schema of a message class in ROS 1 or 2.
 
     Raises MessageError for one that ROS can't define, or that has other fields than ROS's type of its name.
@@ -108,7 +118,7 @@ def records_of(reader: Any, version: int, options: ConversionOptions, losses: Lo
 
 
 def _channel(connection: Any, version: int, options: ConversionOptions) -> tuple[str, Source, RosDecoder] | str | None:
-    """Return topic, publisher and decoder of a connection; in words what is lost of it; None for what is left out."""
+    """Return topic, publisher and decoder of a connection, a description of its loss, or None to leave it out."""
     name, definition = connection.topic, connection.msgdef
     try:
         topic = topic_name(name)

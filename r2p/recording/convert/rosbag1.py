@@ -6,8 +6,8 @@ from typing import Any
 
 from rosbags.rosbag1 import Reader, Writer
 
-from r2p.errors import BagError, MessageError
-from r2p.recording.convert.ros_messages import records_of, ros_schema
+from r2p.errors import BagError
+from r2p.recording.convert.ros_messages import records_of, schema_or_loss
 from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses, RecordSink
 from r2p.units import SECOND
 
@@ -64,13 +64,10 @@ class Rosbag1Sink(RecordSink):
             self._writer.bio.close()
 
     def _connect(self, record: ConvertedRecord) -> Any:
-        """Return the connection of a message; in words what is lost if there can't be one."""
-        if record.cls is None:
-            return f"messages of {record.topic}, whose type is unknown: --type {record.topic}=TYPE states it"
-        try:
-            schema = ros_schema(record.cls, 1)
-        except MessageError as error:
-            return f"messages of {record.topic}: {error}"
+        """Return the connection of a message; without one, the description of its loss."""
+        schema = schema_or_loss(record, 1)
+        if isinstance(schema, str):
+            return schema
         names = [each for each in (record.sample.source.module, record.sample.source.node) if each]
         return self._writer.add_connection(
             f"/{record.topic}",

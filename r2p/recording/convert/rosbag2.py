@@ -14,11 +14,11 @@ from mcap.reader import make_reader
 from mcap.summary import Summary
 from rosbags.rosbag2 import Reader
 
-from r2p.errors import BagError, DecodeError, MessageError
+from r2p.errors import BagError, DecodeError
 from r2p.messages import Message
 from r2p.recording.bag_file import Attachment
 from r2p.recording.convert import mcap_files
-from r2p.recording.convert.ros_messages import records_of, ros_schema
+from r2p.recording.convert.ros_messages import records_of, schema_or_loss
 from r2p.recording.convert.stream import ConversionOptions, ConvertedItem, ConvertedRecord, Losses, RecordSink
 from r2p.recording.entries import MetadataEntry
 from r2p.recording.messages import SampleMeta
@@ -109,13 +109,10 @@ class Rosbag2Sink(RecordSink):
         self._bag.close()
 
     def _problem(self, record: ConvertedRecord) -> str:
-        """Return in words why ROS 2 can't read messages like this one; empty if it can."""
-        if record.cls is None:
-            return f"messages of {record.topic}, whose type is unknown: --type {record.topic}=TYPE states it"
-        try:
-            schema = ros_schema(record.cls, 2)
-        except MessageError as error:
-            return f"messages of {record.topic}: {error}"
+        """Return why ROS 2 can't read messages like this one; empty if it can."""
+        schema = schema_or_loss(record, 2)
+        if isinstance(schema, str):
+            return schema
         self._hashes[schema.name] = schema.checksum
         return ""
 

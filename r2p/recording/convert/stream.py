@@ -96,11 +96,11 @@ class RecordSink(abc.ABC):
         """
 
     def attach(self, attachment: Attachment) -> None:
-        """Write an attachment; most formats have none."""
+        """Write an attachment. Most formats have no place for it."""
         self.losses[ATTACHMENTS] += 1
 
     def describe(self, metadata: MetadataEntry) -> None:
-        """Write a metadata record; most formats have none."""
+        """Write a metadata record. Most formats have no place for it."""
         self.losses[METADATA_RECORDS] += 1
 
     @abc.abstractmethod

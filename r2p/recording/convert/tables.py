@@ -28,7 +28,7 @@ _FILE_NAME_MAX = 200  # bytes of a file's name without its suffix
 
 
 def context_of(record: ConvertedRecord) -> list[Any]:
-    """Return the values of CONTEXT; None for those that a message does not have."""
+    """Return the values of CONTEXT; None for each that a message lacks."""
     sample = record.sample
     source = sample.source
     return [
@@ -140,7 +140,7 @@ class Table(abc.ABC):
         self._cls = cls
 
     def write(self, record: ConvertedRecord) -> str:
-        """Write a row; return in words what is lost if it has no place here, and else nothing."""
+        """Write a row. Return a description of the loss if the table has no place for it, else an empty text."""
         if record.cls is not self._cls:
             return f"messages of {record.topic} of another type than the first"
         try:

@@ -77,7 +77,7 @@ def _chosen(only: list[str]) -> set[str]:
 
 
 def _summarise(bag: "Bag", counts: dict[str, int], first: int | None, last: int | None) -> None:
-    """Report the sums of misses; without anything, why there may be nothing."""
+    """Print the sums of misses, or the possible reasons for an empty result."""
     from r2p.recording.messages import EVENTS
 
     when = f"from {shown(first or bag.start)} to {shown(last or bag.end, date=False)}"

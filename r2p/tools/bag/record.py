@@ -80,7 +80,7 @@ def _check_output(output: Path) -> None:
 
 
 def has_topics(given: Mapping[str, Any]) -> bool:
-    """Return whether topics are recorded: else nothing is sent to the network, on which RTCAN may not be spoken."""
+    """Return whether topics are recorded. For frames alone the command sends nothing: the bus may not speak RTCAN."""
     return bool(given["topics"] or given["all"])
 
 
@@ -304,7 +304,7 @@ def _buses(settings: Settings) -> list[str]:
 
 
 async def _open_buses(settings: Settings) -> None:
-    """Open and close each CAN bus, so that there is no file of one that can't be opened. Raises TransportError."""
+    """Try to open each CAN bus before the file is made. Raises TransportError."""
     from r2p.recording.frame_recorder import FrameRecorder  # only here, as it takes a while
 
     for url in _buses(settings):
