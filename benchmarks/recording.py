@@ -19,10 +19,10 @@ from benchmarks.network import MESSAGE, Eight
 from benchmarks.processes import process
 from benchmarks.table import Row, percentile, rate
 from r2p.recording.bag import Bag
-from r2p.recording.format import CDR, PROFILE, ROS2MSG
+from r2p.recording.format import CDR, PROFILE
 from r2p.recording.recorder import Recorder
-from r2p.recording.types import schema_of
 from r2p.ros.cdr import cdr
+from r2p.ros.ros2_schemas import ROS2MSG, schema_of
 from r2p.tools.bag.record import lower_priority
 from r2p.transports.tcp import TcpListenTransport
 from r2p.transports.url import parse

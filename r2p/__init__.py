@@ -35,6 +35,7 @@ from r2p.errors import (
     TooLong,
     TransportError,
     TypeMismatch,
+    WebError,
 )
 from r2p.messages import (
     Array,
@@ -181,6 +182,7 @@ __all__ = [
     "TopicView",
     "TransportError",
     "TypeMismatch",
+    "WebError",
     "f32",
     "f64",
     "i8",

@@ -100,6 +100,10 @@ class BagError(Error):
     """
 
 
+class WebError(Error):
+    """A page that can't be served: the address is taken, or unsafe without a token, or an extra is not installed."""
+
+
 class NodeCrashed(Error, ExceptionGroup[Exception]):
     """The exceptions of a module's nodes: one for each node that crashed, with a note that names the node."""
 

@@ -10,10 +10,11 @@ from mcap.records import Channel, Schema
 
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import Message, layout
-from r2p.recording.format import CDR, META_PREFIX, OWN_PREFIX, PACKED, ROS2MSG, ChannelInfo
+from r2p.recording.format import CDR, META_PREFIX, OWN_PREFIX, PACKED, ChannelInfo
 from r2p.recording.summary import Summary
 from r2p.recording.types import ChannelType, type_of
 from r2p.ros.cdr import cdr
+from r2p.ros.ros2_schemas import ROS2MSG
 from r2p.ros.transcoding import transcoder
 
 M = TypeVar("M", bound=Message)

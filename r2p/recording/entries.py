@@ -13,9 +13,9 @@ import msgspec
 from r2p.messages import Message
 from r2p.recording.format import CDR, SEQUENCE_MASK
 from r2p.recording.samples import SampleWriter
-from r2p.recording.types import schema_of
 from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import cdr
+from r2p.ros.ros2_schemas import schema_of
 from r2p.runtime.sample import Sample
 
 P = TypeVar("P")

@@ -43,8 +43,6 @@ CDR = "cdr"
 PACKED = "r2p"
 """The encoding of a message as r2p packs it (PROTOCOL.md 2)."""
 
-ROS2MSG = "ros2msg"
-
 OWN_PREFIX = "/r2p/"
 META_PREFIX = f"{OWN_PREFIX}meta/"
 """Before the name of a topic: the channel of the companion."""

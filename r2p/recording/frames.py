@@ -25,9 +25,9 @@ from r2p.messages import Len, Max, Message, i64, u8, u32, u64
 from r2p.msg import Header
 from r2p.recording.entries import BagEntry, EntryWriter
 from r2p.recording.format import CDR, SEQUENCE_MASK
-from r2p.recording.types import schema_of
 from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import HEADER as CDR_HEADER
+from r2p.ros.ros2_schemas import schema_of
 from r2p.units import SECOND
 
 FRAME_TYPE = "can_msgs/msg/Frame"

@@ -10,9 +10,10 @@ from r2p.errors import DecodeError, MessageError
 from r2p.messages import ClockOffset, Message, layout
 from r2p.recording.format import CDR, META_PREFIX, PACKED, SEQUENCE_MASK, ChannelInfo
 from r2p.recording.messages import REST_MAX, SampleMeta
-from r2p.recording.types import Ros2Schema, schema_of, type_of
+from r2p.recording.types import type_of
 from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import cdr
+from r2p.ros.ros2_schemas import Ros2Schema, schema_of
 from r2p.ros.transcoding import transcoder
 from r2p.runtime.sample import PublisherClass, Sample, Source
 

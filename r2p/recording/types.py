@@ -1,4 +1,4 @@
-"""The types of channels: the class of a channel, and the schema by which other programs read it."""
+"""The types of channels: the class by which the messages of a channel are read."""
 
 import contextlib
 import functools
@@ -8,38 +8,9 @@ import msgspec
 from r2p.errors import MessageError
 from r2p.messages import Message, layout
 from r2p.messages.schemas import message_type
-from r2p.recording.format import ROS2MSG, ChannelInfo
-from r2p.ros.classes import RosTypes, definitions_of, standard_classes
-from r2p.ros.definitions import definition_text, parse
-from r2p.ros.type_names import ros2_name, short_name
-
-_TIMES = {
-    **parse("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n"),
-    **parse("builtin_interfaces/Duration", "int32 sec\nuint32 nanosec\n"),
-}
-"""What ROS 2 knows without its definition; a file has to say it."""
-
-
-class Ros2Schema(msgspec.Struct, frozen=True):
-    """A schema of the encoding `ros2msg`: the name of the type in ROS 2, and its definition with those in it."""
-
-    name: str
-    text: str
-
-    @property
-    def record(self) -> tuple[str, str, bytes]:
-        """The schema as `BagWriter.add_channel` takes it: name, encoding and text."""
-        return self.name, ROS2MSG, self.text.encode()
-
-
-@functools.lru_cache(maxsize=1024)
-def schema_of(cls: type[Message]) -> Ros2Schema:
-    """Return the schema of a message class. Raises MessageError for one that ROS 2 can't define."""
-    name = layout(cls).name
-    definitions = definitions_of(cls, 2)
-    for each in definitions:
-        short_name(each)
-    return Ros2Schema(ros2_name(name), definition_text(name, _TIMES | definitions))
+from r2p.recording.format import ChannelInfo
+from r2p.ros.classes import RosTypes, standard_classes
+from r2p.ros.definitions import parse
 
 
 class ChannelType(msgspec.Struct, frozen=True, eq=False):

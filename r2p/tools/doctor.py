@@ -41,6 +41,8 @@ EXTRAS = {
     "elf": "pyelftools",
     "ros": "rosbags",
     "serial": "pyserial",
+    "ui": "textual",
+    "web": "websockets",
     "zenoh": "eclipse-zenoh",
 }
 """The extras of r2p, and the package of each."""

@@ -37,6 +37,7 @@ COMMANDS = {
     "launch": ("r2p.tools.launch", "Start the commands of a file as one group, such as a robot."),
     "gateway": ("r2p.tools.gateway", "Join links to one network: a robot's bus, a debug line, zenoh."),
     "sim": ("r2p.tools.simulator", "Run an emulated robot, without hardware."),
+    "dash": ("r2p.tools.dash", "Show the network, or a recording, in a browser."),
     "log": ("r2p.tools.log", "Print the log records of all modules."),
     "wait": ("r2p.tools.waiting", "Wait until a topic, node or module is there, for scripts."),
     "doctor": ("r2p.tools.doctor", "Check what this machine has and lacks for r2p, or try a link."),

@@ -14,9 +14,9 @@ import r2p
 from r2p.msg import Led, Odometry
 from r2p.recording.bag import Bag
 from r2p.recording.messages import SampleMeta
-from r2p.recording.types import schema_of
 from r2p.recording.writer import BagWriter
 from r2p.ros.cdr import cdr
+from r2p.ros.ros2_schemas import schema_of
 from tests.recording.making import MS, T0, led, leds, of, plain, write
 
 

@@ -15,10 +15,10 @@ from r2p.recording.channels import BagChannel
 from r2p.recording.convert.ros_messages import RosDecoder, ros_decoder
 from r2p.recording.convert.stream import ConversionOptions, ConvertedItem, ConvertedRecord, Losses, RecordSink
 from r2p.recording.entries import MetadataEntry
-from r2p.recording.format import CDR, OWN_PREFIX, ROS2MSG
+from r2p.recording.format import CDR, OWN_PREFIX
 from r2p.recording.samples import SampleWriter
-from r2p.recording.types import schema_of
 from r2p.recording.writer import BagWriter
+from r2p.ros.ros2_schemas import ROS2MSG, schema_of
 from r2p.ros.transcoding import transcoder
 from r2p.runtime.sample import Sample, Source
 

@@ -30,7 +30,8 @@ from r2p.recording.convert.tables import (
     tables,
 )
 from r2p.recording.format import ChannelInfo
-from r2p.recording.types import schema_of, type_of
+from r2p.recording.types import type_of
+from r2p.ros.ros2_schemas import schema_of
 
 _SUFFIX = ".parquet"
 _ROWS = 8192  # of a group, which are held in memory, if they have less than _HELD_MAX

@@ -11,11 +11,11 @@ from r2p.errors import DecodeError, InvalidName, MessageError
 from r2p.messages import Message, layout
 from r2p.names import topic_name
 from r2p.recording.convert.stream import ConversionOptions, ConvertedRecord, Losses
-from r2p.recording.types import schema_of
 from r2p.ros.classes import definitions_of, standard_classes
 from r2p.ros.definitions import definition_text
 from r2p.ros.library import definitions_of_ros, definitions_with_those_of_ros, ros1_md5, ros2_hash
 from r2p.ros.packages import OF_ROS
+from r2p.ros.ros2_schemas import schema_of
 from r2p.ros.stamps import StampSource
 from r2p.ros.topics import ros_class
 from r2p.ros.transcoding import transcoder

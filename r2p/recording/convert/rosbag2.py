@@ -22,8 +22,8 @@ from r2p.recording.convert.ros_messages import records_of, schema_or_loss
 from r2p.recording.convert.stream import ConversionOptions, ConvertedItem, ConvertedRecord, Losses, RecordSink
 from r2p.recording.entries import MetadataEntry
 from r2p.recording.messages import SampleMeta
-from r2p.recording.types import schema_of
 from r2p.ros.library import ros2_hash
+from r2p.ros.ros2_schemas import schema_of
 from r2p.ros.transcoding import transcoder
 from r2p.runtime.sample import Sample
 

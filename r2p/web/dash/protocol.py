@@ -1,0 +1,193 @@
+"""What a page of `r2p dash` and its process tell each other, over one WebSocket at `/dash`.
+
+    page to process   a JSON object each: a request, with `op` and a number `id`
+    process to page   a JSON object each: the answer, {"id": 3, "result": ...} or {"id": 3, "error": "why"}; or news,
+                      which have `op` and no `id`
+    process to page   bytes: the points of plots
+
+News:
+
+    hello       first of all: what the page may do, and whether it shows a network or a recording
+    state       the figures that have changed since the last one: {"op": "state", "time": ns, "changed": {"topics":
+                {NAME: figures}, ...}, "gone": {"topics": [NAME, ...], ...}}; first all of them. Tables: modules,
+                topics, services, links ("MODULE LINK"), buses
+    log         {"op": "log", "records": [...], "dropped": n}
+    message     the newest message of a watched topic, ten times a second at most: {"op": "message", "topic": ...,
+                "time": ns, "module": ..., "node": ..., "sequence": n, "skipped": n, "fields": {...}}
+    dropped     {"op": "dropped", "streams": {NAME: n}}: what this page was too slow for, in all
+    clock       of a recording: {"op": "clock", "time": ns, "playing": true, "rate": 1.0}
+
+Points, little-endian: u8 1, u8 number of columns, u16 stream, u32 number of points, f64 times (s, UTC), then f64 values
+of the first column, of the second one, ... NaN: the message had no value there.
+"""
+
+import struct
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import msgspec
+
+POINTS = 1
+_HEAD = struct.Struct("<BBHI")
+
+
+class _Request(msgspec.Struct, tag_field="op", forbid_unknown_fields=True, kw_only=True):
+    id: int
+
+
+class Plot(_Request, tag="plot"):
+    """Send points of fields ("odometry.pose.x", "scan.ranges[3]"), all of one topic, as `stream`.
+
+    A recording answers with at most `points` for each column between `start` and `end` (s, UTC); the smallest and the
+    largest value of each step are among them.
+    """
+
+    stream: int
+    fields: list[str]
+    start: float | None = None
+    end: float | None = None
+    points: int = 2000
+
+
+class StopPlot(_Request, tag="stop_plot"):
+    """Send no more points of a stream."""
+
+    stream: int
+
+
+class Watch(_Request, tag="watch"):
+    """Send the newest messages of a topic, decoded; `measure` also its latency and losses in its figures."""
+
+    topic: str
+
+
+class Unwatch(_Request, tag="unwatch"):
+    """Send no more messages of a topic."""
+
+    topic: str
+
+
+class FollowLog(_Request, tag="log"):
+    """Send log records, from now on and the last ones before; `level` DEBUG, INFO, WARNING, ERROR, FATAL and above."""
+
+    level: str = "INFO"
+
+
+class Describe(_Request, tag="describe"):
+    """Answer with a type: {"type": ..., "fields": [{"path", "kind", "enum"?, "length"?, "plottable"}], "zero": {...}}.
+
+    Of a topic; or of a service's request and response: {"request": {...}, "response": {...}}.
+    """
+
+    topic: str = ""
+    service: str = ""
+
+
+class Publish(_Request, tag="publish"):
+    """Publish a message, once, or `rate` times a second until another one comes or the page leaves."""
+
+    topic: str
+    value: dict[str, Any]
+    type: str = ""
+    rate: float = 0.0
+
+
+class CallService(_Request, tag="call"):
+    """Call a service, and answer with its response."""
+
+    service: str
+    value: dict[str, Any]
+    timeout: float = 5.0
+
+
+class ListParameters(_Request, tag="parameters"):
+    """Answer with the parameters of a module, as `ParameterInfo`."""
+
+    module: str
+
+
+class SetParameters(_Request, tag="set_parameters"):
+    """Set parameters of a node, all or nothing; None is the value of the start."""
+
+    module: str
+    node: str
+    values: dict[str, Any]
+
+
+class SaveParameters(_Request, tag="save_parameters"):
+    """Have a module save what was set."""
+
+    module: str
+
+
+class OrderNode(_Request, tag="node"):
+    """Start, stop or restart a node."""
+
+    module: str
+    node: str
+    order: Literal["start", "stop", "restart"]
+
+
+class OrderModule(_Request, tag="module"):
+    """Stop, start or reboot a module."""
+
+    module: str
+    order: Literal["stop", "start", "reboot"]
+
+
+class Seek(_Request, tag="seek"):
+    """Show a recording as it was at a time (ns, UTC)."""
+
+    time: int
+
+
+class Play(_Request, tag="play"):
+    """Let the time of a recording run, at a rate; 0 stops it."""
+
+    rate: float = 1.0
+
+
+class Timeline(_Request, tag="timeline"):
+    """Answer with what happened in a recording: {"start", "end", "events": [...], "misses": [...], "topics": {...}}."""
+
+
+DashRequest = (
+    Plot
+    | StopPlot
+    | Watch
+    | Unwatch
+    | FollowLog
+    | Describe
+    | Publish
+    | CallService
+    | ListParameters
+    | SetParameters
+    | SaveParameters
+    | OrderNode
+    | OrderModule
+    | Seek
+    | Play
+    | Timeline
+)
+
+_decoder = msgspec.json.Decoder(DashRequest)
+encode = msgspec.json.Encoder().encode
+"""Encodes what the page is told: figures, `ParameterInfo` and plain values."""
+
+
+def decode(data: str | bytes) -> DashRequest:
+    """Decode a request. Raises msgspec.ValidationError or msgspec.DecodeError, in words for the author of a page."""
+    request: DashRequest = _decoder.decode(data)
+    return request
+
+
+def points(stream: int, times: Sequence[float], columns: Sequence[Sequence[float]]) -> bytes:
+    """Encode points: `times` in s, and the values of each column at these."""
+    count = len(times)
+    return b"".join(
+        (
+            _HEAD.pack(POINTS, len(columns), stream, count),
+            struct.pack(f"<{count}d", *times),
+            *(struct.pack(f"<{count}d", *column) for column in columns),
+        )
+    )

@@ -1,0 +1,72 @@
+// The connection to the process that serves this page: r2p/web/dash/protocol.py says what both tell each other.
+
+const POINTS = 1
+const RETRY = 1000 // ms
+const TOKEN = "r2p-token"
+
+// The token of the link stays in this tab, and out of the address bar.
+function token() {
+  const given = new URLSearchParams(location.hash.slice(1)).get("token")
+  if (given) {
+    sessionStorage.setItem(TOKEN, given)
+    history.replaceState(null, "", location.pathname)
+  }
+  return sessionStorage.getItem(TOKEN)
+}
+
+export class Connection extends EventTarget {
+  #socket = null
+  #pending = new Map()
+  #streams = new Map()
+  #next = 1
+  #token = token()
+
+  open() {
+    const query = this.#token ? `?token=${encodeURIComponent(this.#token)}` : ""
+    const socket = new WebSocket(`ws://${location.host}/dash${query}`)
+    socket.binaryType = "arraybuffer"
+    socket.onmessage = event => this.#receive(event.data)
+    socket.onclose = event => this.#lose(event.reason)
+    this.#socket = socket
+  }
+
+  // Ask the process, and return the promise of its answer; it fails with the reason that the process gives.
+  request(op, values = {}) {
+    if (this.#socket?.readyState !== WebSocket.OPEN) return Promise.reject(new Error("not connected"))
+    const id = this.#next++
+    this.#socket.send(JSON.stringify({ op, id, ...values }))
+    return new Promise((resolve, reject) => this.#pending.set(id, { resolve, reject }))
+  }
+
+  // Call `handle(times, columns)` with the points of a stream; null: no longer.
+  onPoints(stream, handle) {
+    if (handle) this.#streams.set(stream, handle)
+    else this.#streams.delete(stream)
+  }
+
+  #receive(data) {
+    if (typeof data !== "string") return this.#receivePoints(data)
+    const message = JSON.parse(data)
+    if (message.op) return this.dispatchEvent(new CustomEvent(message.op, { detail: message }))
+    const pending = this.#pending.get(message.id)
+    this.#pending.delete(message.id)
+    if (message.error !== undefined) pending?.reject(new Error(message.error))
+    else pending?.resolve(message.result)
+  }
+
+  #receivePoints(data) {
+    const view = new DataView(data)
+    if (view.getUint8(0) !== POINTS) return
+    const count = view.getUint32(4, true)
+    const column = index => new Float64Array(data, 8 + 8 * count * index, count)
+    const columns = Array.from({ length: view.getUint8(1) }, (_, index) => column(index + 1))
+    this.#streams.get(view.getUint16(2, true))?.(column(0), columns)
+  }
+
+  #lose(reason) {
+    for (const { reject } of this.#pending.values()) reject(new Error("the connection was lost"))
+    this.#pending.clear()
+    this.dispatchEvent(new CustomEvent("lost", { detail: reason }))
+    setTimeout(() => this.open(), RETRY)
+  }
+}

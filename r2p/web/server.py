@@ -1,0 +1,222 @@
+"""The listener of pages and protocols: files by HTTP, messages by WebSocket, from one port of this process.
+
+Safe by default: it listens on loopback, and elsewhere only with a token that each WebSocket has to name. A browser may
+connect only from a page of this server, or of an origin that is allowed: no other page that the user has open can read
+the robot's network. Files are no secret, so they need no token.
+"""
+
+import hmac
+import http
+import ipaddress
+import logging
+import secrets
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from types import TracebackType
+from typing import Self
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from r2p.errors import WebError
+from r2p.log_lines import get_logger
+from r2p.web.client import WebClient
+
+logger = get_logger("r2p.web")
+
+LOOPBACK = "127.0.0.1"
+
+_MESSAGE_MAX = 1 << 20  # bytes of a message from a client
+_MESSAGES_MAX = 16  # that wait for their handler
+_WRITE_BUFFER = 1 << 18  # bytes of a connection beyond which its client's own queue fills
+_CLIENTS_MAX = 64
+_CSP = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS = {
+    "Content-Security-Policy": _CSP,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",
+}
+
+
+class WebFile(msgspec.Struct, frozen=True):
+    """A file that is served: its media type, and its bytes."""
+
+    media_type: str
+    data: bytes
+
+
+class WebEndpoint(msgspec.Struct, frozen=True):
+    """Speaks WebSocket at a path. `subprotocols`: those that it accepts, the first one of the client's; empty: any.
+
+    `handle` runs for each client until it returns or the client leaves.
+    """
+
+    handle: Callable[[WebClient], Awaitable[None]]
+    subprotocols: tuple[str, ...] = ()
+
+
+class WebOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """Where a server listens, and who may connect. `port` 0 takes a free one.
+
+    `token`: what clients must name; None: a random one where the address is not loopback. `origins`: pages of other
+    servers that may connect, as `https://app.foxglove.dev`.
+    """
+
+    host: str = LOOPBACK
+    port: int = 0
+    token: str | None = None
+    origins: tuple[str, ...] = ()
+
+
+class WebServer:
+    """Serves `files` by path, and `endpoints` by path, while its block is open."""
+
+    def __init__(
+        self, options: WebOptions, endpoints: Mapping[str, WebEndpoint], files: Mapping[str, WebFile] | None = None
+    ) -> None:
+        self.refused: dict[str, int] = {}
+        """Connections that were refused, by reason."""
+        self.clients: list[WebClient] = []
+        self._options = options
+        self._endpoints = endpoints
+        self._files = files or {}
+        token = options.token
+        self.token = secrets.token_urlsafe(16) if token is None and not is_loopback(options.host) else token
+        """What each WebSocket has to name as `?token=`; None: nothing."""
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Where the server listens: host and port."""
+        host, port, *_ = next(iter(self._server.sockets)).getsockname()
+        return host, port
+
+    @property
+    def url(self) -> str:
+        """The address of the page; with the token behind #, where it stays in the browser."""
+        host, port = self.address
+        shown = f"[{host}]" if ":" in host else host
+        return f"http://{shown}:{port}/" + (f"#token={self.token}" if self.token else "")
+
+    async def __aenter__(self) -> Self:
+        """Begin to listen. Raises WebError if the address can't be used."""
+        try:
+            self._server: Server = await serve(
+                self._handle,
+                self._options.host,
+                self._options.port,
+                process_request=self._answer,
+                select_subprotocol=self._select_subprotocol,
+                compression=None,
+                max_size=_MESSAGE_MAX,
+                max_queue=_MESSAGES_MAX,
+                write_limit=_WRITE_BUFFER,
+                server_header=None,
+                logger=_quiet,
+            )
+        except OSError as error:
+            where = f"{self._options.host}:{self._options.port}"
+            text = f"can't listen on {where}: {error.strerror or error}; choose another --port, or 0 for a free one"
+            raise WebError(text) from error
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop listening, and close all connections."""
+        self._server.close()
+        await self._server.wait_closed()
+
+    # A request
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return the answer to a request; None for a WebSocket that may open."""
+        path = urlsplit(request.path).path
+        if not self._is_own_host(request.headers):
+            return self._refuse(http.HTTPStatus.FORBIDDEN, "unknown host")
+        if "Upgrade" not in request.headers:
+            return self._file(path)
+        if path not in self._endpoints:
+            return self._refuse(http.HTTPStatus.NOT_FOUND, "unknown path")
+        if not self._is_own_origin(request.headers):
+            return self._refuse(http.HTTPStatus.FORBIDDEN, "origin")
+        if not self._has_token(request):
+            return self._refuse(http.HTTPStatus.UNAUTHORIZED, "token")
+        if len(self.clients) >= _CLIENTS_MAX:
+            return self._refuse(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many clients")
+        return None
+
+    def _file(self, path: str) -> Response:
+        file = self._files.get("/index.html" if path == "/" else path)
+        if file is None:
+            return _response(http.HTTPStatus.NOT_FOUND, WebFile("text/plain", b"not found\n"))
+        return _response(http.HTTPStatus.OK, file)
+
+    def _refuse(self, status: http.HTTPStatus, reason: str) -> Response:
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+        return _response(status, WebFile("text/plain", f"{status.phrase}: {reason}\n".encode()))
+
+    def _is_own_host(self, headers: Headers) -> bool:
+        """Return whether a request names an address of this computer, not a name that somebody else's DNS gives it."""
+        host = urlsplit(f"//{headers.get('Host', '')}").hostname or ""
+        return host == "localhost" or host == self._options.host or _is_address(host)
+
+    def _is_own_origin(self, headers: Headers) -> bool:
+        origins = headers.get_all("Origin")
+        own = f"http://{headers.get('Host', '')}"
+        return all(each == own or each in self._options.origins for each in origins)
+
+    def _has_token(self, request: Request) -> bool:
+        if self.token is None:
+            return True
+        given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        return hmac.compare_digest(given.encode(), self.token.encode())
+
+    def _select_subprotocol(self, connection: ServerConnection, offered: Iterable[Subprotocol]) -> Subprotocol | None:
+        assert connection.request is not None
+        accepted = self._endpoints[urlsplit(connection.request.path).path].subprotocols
+        return next((each for each in offered if each in accepted), None)
+
+    # A client
+
+    async def _handle(self, connection: ServerConnection) -> None:
+        assert connection.request is not None
+        endpoint = self._endpoints[urlsplit(connection.request.path).path]
+        if endpoint.subprotocols and connection.subprotocol is None:
+            await connection.close(1002, f"offer a subprotocol: {' or '.join(endpoint.subprotocols)}")
+            return
+        async with WebClient(connection) as client:
+            self.clients.append(client)
+            try:
+                await endpoint.handle(client)
+            finally:
+                self.clients.remove(client)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only programs of this computer reach an address."""
+    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _response(status: http.HTTPStatus, file: WebFile) -> Response:
+    headers = Headers(
+        {**_HEADERS, "Content-Type": file.media_type, "Content-Length": str(len(file.data)), "Connection": "close"}
+    )
+    return Response(status, status.phrase, headers, file.data)
+
+
+_quiet = logging.Logger("r2p.web.connections", logging.CRITICAL)  # what clients do wrong is no trouble of this program
