@@ -11,9 +11,12 @@ News:
     state       the figures that have changed since the last one: {"op": "state", "time": ns, "changed": {"topics":
                 {NAME: figures}, ...}, "gone": {"topics": [NAME, ...], ...}}; first all of them. Tables: modules,
                 topics, services, links ("MODULE LINK"), buses
-    log         {"op": "log", "records": [...], "dropped": n}
+    log         {"op": "log", "records": [{"time": ns, "level": 20, "module": ..., "node": ..., "text": ...}, ...],
+                "dropped": n}: levels as in Python's logging; `dropped` records of before these were lost, in all
     message     the newest message of a watched topic, ten times a second at most: {"op": "message", "topic": ...,
                 "time": ns, "module": ..., "node": ..., "sequence": n, "skipped": n, "fields": {...}}
+    published   of a topic that is published at a rate, once a second, and at its end: {"op": "published", "topic": ...,
+                "sent": n, "running": bool, "error"?: why it has ended}
     dropped     {"op": "dropped", "streams": {NAME: n}}: what this page was too slow for, in all
     clock       of a recording: {"op": "clock", "time": ns, "playing": true, "rate": 1.0}
 
@@ -74,9 +77,15 @@ class FollowLog(_Request, tag="log"):
 
 
 class Describe(_Request, tag="describe"):
-    """Answer with a type: {"type": ..., "fields": [{"path", "kind", "enum"?, "length"?, "plottable"}], "zero": {...}}.
+    """Answer with a type: {"type": ..., "fields": [{"path", "kind", ...}, ...], "zero": {...}}.
 
     Of a topic; or of a service's request and response: {"request": {...}, "response": {...}}.
+
+    Fields are in their order, and flat: "pose", "pose.x". Parts of each element of an array have [] in their path:
+    "points[].x". `kind` is a number's ("u8" to "u64", "i8" to "i64", "f32", "f64"), "bool", "text", or "message", whose
+    parts follow. Of arrays it is that of the elements, and there is a `length`; or a `max`, if it varies. A text has a
+    `limit` of bytes. Where there are names for its values a field has an `enum`: {"AUTO": 1, ...}. `plottable` is set
+    for what `Plot` takes. `zero` is the message with all fields zero, as `Publish` takes it.
     """
 
     topic: str = ""
@@ -84,12 +93,18 @@ class Describe(_Request, tag="describe"):
 
 
 class Publish(_Request, tag="publish"):
-    """Publish a message, once, or `rate` times a second until another one comes or the page leaves."""
+    """Publish a message, once, or `rate` times a second until another one comes, it is stopped, or the page leaves."""
 
     topic: str
     value: dict[str, Any]
     type: str = ""
     rate: float = 0.0
+
+
+class StopPublishing(_Request, tag="stop_publishing"):
+    """Publish a topic no more at a rate."""
+
+    topic: str
 
 
 class CallService(_Request, tag="call"):
@@ -101,7 +116,7 @@ class CallService(_Request, tag="call"):
 
 
 class ListParameters(_Request, tag="parameters"):
-    """Answer with the parameters of a module, as `ParameterInfo`."""
+    """Answer with the parameters of a module, as a list of `ParameterInfo`."""
 
     module: str
 
@@ -159,6 +174,7 @@ DashRequest = (
     | FollowLog
     | Describe
     | Publish
+    | StopPublishing
     | CallService
     | ListParameters
     | SetParameters
