@@ -12,7 +12,7 @@ class Figures(msgspec.Struct, omit_defaults=True):
     """The base of all figures: JSON leaves out what is not known."""
 
 
-class Latency(Figures):
+class LatencyFigures(Figures):
     """The time from publishing to the arrival at this tool, over the last second: of `count` messages."""
 
     p50: float
@@ -67,7 +67,7 @@ class TopicFigures(Figures):
     rate_source: str | None = None
     bandwidth: float | None = None
     laxity: float | None = None
-    latency: Latency | None = None
+    latency: LatencyFigures | None = None
     missed: int | None = None
     late: int | None = None
     lost_on_way: int | None = None

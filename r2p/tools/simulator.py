@@ -31,7 +31,14 @@ from r2p.parameters.sources import ParameterSource, from_options, of_module, rea
 from r2p.sim.modules.boards import ParameterOptions
 from r2p.sim.physics.world import Triple, Wall, World, box
 from r2p.sim.robots.emulated import MODULES, Triskar2
-from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, OdometryFigures, TopicFigures, WheelFigures
+from r2p.sim.robots.figures import (
+    FiguresReader,
+    OdometryFigures,
+    RobotBusFigures,
+    RobotFigures,
+    RobotTopicFigures,
+    WheelFigures,
+)
 from r2p.sim.robots.triskar2 import square
 from r2p.tools.config import CONFIG, Settings, did_you_mean
 from r2p.tools.options import Params, ParamsFile, Quiet, Verbose, Via, time_option
@@ -330,7 +337,7 @@ class SimulatorScreen:
         if not self.live:
             self.print(*hints)
 
-    def show(self, figures: Figures) -> None:
+    def show(self, figures: RobotFigures) -> None:
         """Draw the figures, or print a line about them."""
         if self.live:
             self._view.update(self.draw(figures), refresh=True)
@@ -339,7 +346,7 @@ class SimulatorScreen:
             if figures.too_slow:
                 self.print(f"          {_too_slow(figures)}")
 
-    def print_summary(self, figures: Figures, *, fast: bool) -> None:
+    def print_summary(self, figures: RobotFigures, *, fast: bool) -> None:
         """Print a summary; `fast`: of a run in virtual time, which no PC is too slow for."""
         x, y, _ = figures.pose
         self.print("", f"{figures.time:.1f} s, {figures.path:.2f} m driven; the robot is at x {x:.3f}, y {y:.3f} m")
@@ -358,7 +365,7 @@ class SimulatorScreen:
                 f"  end other programs, or simulate in virtual time: {program()} sim --fast",
             )
 
-    def draw(self, figures: Figures) -> RenderableType:
+    def draw(self, figures: RobotFigures) -> RenderableType:
         """Return the figures, as many as fit the terminal."""
         width, height = self.console.size
         lines = state(figures)
@@ -377,7 +384,7 @@ class SimulatorScreen:
         return Group(*parts, *commands)
 
 
-def _title(figures: Figures, duration: float | None, width: int) -> Text:
+def _title(figures: RobotFigures, duration: float | None, width: int) -> Text:
     """Return the title line: how long, how far, and how many deadlines were missed, or that the PC is too slow."""
     until = f" of {duration:.0f}" if duration else ""
     late = f"{figures.missed or 'no'} deadline{'' if figures.missed == 1 else 's'} missed"
@@ -389,11 +396,11 @@ def _title(figures: Figures, duration: float | None, width: int) -> Text:
     return Text(f"{text:{max(0, width - len(late) - 1)}}{late} ", style="bold reverse", no_wrap=True)
 
 
-def _too_slow(figures: Figures) -> str:
+def _too_slow(figures: RobotFigures) -> str:
     return f"PC too slow: {figures.late:.0%} late"
 
 
-def state(figures: Figures) -> list[str]:
+def state(figures: RobotFigures) -> list[str]:
     """Return nine lines of 48 characters about the robot and its bus."""
     # Position and odometry of one instant, so that they can be compared: in 0.1 s the robot drives 5 cm.
     x, y, w = figures.odometry.truth if figures.odometry and figures.odometry.fresh else figures.pose
@@ -422,7 +429,7 @@ def _accuracy(odometry: OdometryFigures, off_max: float) -> str:
     return f"odometry: off by {now} mm{before}: no two wheels have the same size"
 
 
-def bus_lines(bus: BusFigures | None) -> list[str]:
+def bus_lines(bus: RobotBusFigures | None) -> list[str]:
     """Return two lines about the bus."""
     if bus is None:
         return ["CAN bus   none: a network in memory"]
@@ -430,7 +437,7 @@ def bus_lines(bus: BusFigures | None) -> list[str]:
     return [f"CAN bus   {bus.load:.0%} load  {bus.rate:.0f} frames/s  {bus.errors} errors", f"slots     {slots}"]
 
 
-def line(figures: Figures) -> str:
+def line(figures: RobotFigures) -> str:
     """Return one line of plain text, at most 80 characters."""
     x, y, w = figures.pose
     speeds = " ".join(f"{wheel.speed:z6.2f}" for wheel in figures.wheels)
@@ -445,7 +452,7 @@ def _wheel(wheel: WheelFigures) -> str:
     return f"{wheel.name}    {wanted:>7}   {wheel.speed:z7.2f}          {wheel.current:z6.2f} A"
 
 
-def _table(topics: Iterable[TopicFigures], *, names_only: bool) -> Table:
+def _table(topics: Iterable[RobotTopicFigures], *, names_only: bool) -> Table:
     table = Table(box=None, pad_edge=False, collapse_padding=True, header_style="bold")
     table.add_column("TOPIC", min_width=13, no_wrap=True)
     for name, width in () if names_only else (("FROM", 8), ("REAL TIME", 17)):

@@ -24,7 +24,14 @@ from r2p.sim import can_bus
 from r2p.sim.modules.boards import ParameterOptions
 from r2p.sim.physics.world import World, box
 from r2p.sim.robots.emulated import MOTORS, Triskar2
-from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, OdometryFigures, TopicFigures, WheelFigures
+from r2p.sim.robots.figures import (
+    FiguresReader,
+    OdometryFigures,
+    RobotBusFigures,
+    RobotFigures,
+    RobotTopicFigures,
+    WheelFigures,
+)
 from r2p.sim.robots.triskar2 import square
 from r2p.tools import simulator
 from r2p.tools.config import Settings
@@ -199,20 +206,20 @@ def test_fast_prints_a_line_each_ten_seconds_and_sums_up(capsys: pytest.CaptureF
 
 def test_the_state_fits_beside_the_map() -> None:
     wheels = [WheelFigures(f"MOTOR{n}", True, -10.0, -10.12, -10.0) for n in (1, 2, 3)]
-    bus = BusFigures(1.0, 7654.3, 999_999, 99, 10.5, 60)
+    bus = RobotBusFigures(1.0, 7654.3, 999_999, 99, 10.5, 60)
     odometry = OdometryFigures(Pose3(-10.5, -10.5, -3.0), (-10.5, -10.377, -3.0), 0.1)
-    figures = Figures(3600.0, (-10.5, -10.5, -3.0), 999.99, odometry, wheels, (25.6, 10.0, 1.0), [], bus)
+    figures = RobotFigures(3600.0, (-10.5, -10.5, -3.0), 999.99, odometry, wheels, (25.6, 10.0, 1.0), [], bus)
     lines = simulator.state(figures)
     assert len(lines) == 9
     assert max(len(line) for line in lines) <= 48
 
 
-def moment() -> Figures:
+def moment() -> RobotFigures:
     """Figures of a robot at rest, with ten topics."""
     wheels = [WheelFigures(f"MOTOR{n}", True, -10.0, -10.12, -10.0) for n in (1, 2, 3)]
-    bus = BusFigures(0.5, 1000.0, 9999, 0, 2.5, 60)
-    rows = [TopicFigures(f"topic{n}", "MOTOR1", "soft: by deadline", 50.0, 1000, 1) for n in range(10)]
-    return Figures(3.5, (0.0, 0.0, 0.0), 1.0, None, wheels, (25.6, 10.0, 1.0), rows, bus)
+    bus = RobotBusFigures(0.5, 1000.0, 9999, 0, 2.5, 60)
+    rows = [RobotTopicFigures(f"topic{n}", "MOTOR1", "soft: by deadline", 50.0, 1000, 1) for n in range(10)]
+    return RobotFigures(3.5, (0.0, 0.0, 0.0), 1.0, None, wheels, (25.6, 10.0, 1.0), rows, bus)
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ _CLASSES = {
 _URGENCY = [_HARD, _PERIODIC, _SOFT, _NOT]
 
 
-class TopicFigures(msgspec.Struct, frozen=True):
+class RobotTopicFigures(msgspec.Struct, frozen=True):
     """One publisher: its real-time class, messages per second, and messages since the start."""
 
     topic: str
@@ -70,7 +70,7 @@ class WheelFigures(msgspec.Struct, frozen=True):
     current: float
 
 
-class BusFigures(msgspec.Struct, frozen=True):
+class RobotBusFigures(msgspec.Struct, frozen=True):
     """The bus: load (0 to 1) and frames per second, totals since the start, and reserved slots."""
 
     load: float
@@ -84,7 +84,7 @@ class BusFigures(msgspec.Struct, frozen=True):
     """Load since the start, 0 to 1."""
 
 
-class Figures(msgspec.Struct, frozen=True):
+class RobotFigures(msgspec.Struct, frozen=True):
     """All figures at a time, in s since the start."""
 
     time: float
@@ -94,8 +94,8 @@ class Figures(msgspec.Struct, frozen=True):
     wheels: list[WheelFigures]
     battery: tuple[float, float, float]
     """V, A, and 0 to 1."""
-    topics: list[TopicFigures]
-    bus: BusFigures | None
+    topics: list[RobotTopicFigures]
+    bus: RobotBusFigures | None
     off_max: float = 0.0
     """The largest distance of an odometry from the true position so far, m."""
     late: float = 0.0
@@ -147,7 +147,7 @@ class FiguresReader:
         self._heard = self._clock.monotonic()
         self._off_max = max(self._off_max, self._odometry.off)
 
-    def read(self, time: float) -> Figures:
+    def read(self, time: float) -> RobotFigures:
         """Return the figures; `time` is now, in s since the start."""
         hardware = self._robot.hardware
         battery = hardware.battery
@@ -160,7 +160,7 @@ class FiguresReader:
         if late > _LATE_MAX:
             self._slow += time - self._last
         self._last = time
-        return Figures(
+        return RobotFigures(
             time,
             self._robot.pose,
             hardware.body.path,
@@ -212,13 +212,13 @@ class FiguresReader:
         total = self._bus.bus.statistics.total
         return _Reading(time, sent, ticks, (total.frames, total.occupied, total.errors))
 
-    def _topic(self, module: r2p.Module, publisher: AnyPublisher, now: _Reading) -> TopicFigures:
+    def _topic(self, module: r2p.Module, publisher: AnyPublisher, now: _Reading) -> RobotTopicFigures:
         key = _key(module, publisher)
         sent, missed = self._started.get(key, (0, 0))
         if publisher.sent < sent:  # its module was switched off and on
             sent, missed = self._started[key] = (0, 0)
         before = self._readings[0]
-        return TopicFigures(
+        return RobotTopicFigures(
             publisher.topic,
             module.name,
             _real_time(module, publisher),
@@ -227,13 +227,13 @@ class FiguresReader:
             publisher.missed - missed,
         )
 
-    def _bus_figures(self, bus: SimCan, now: _Reading) -> BusFigures:
+    def _bus_figures(self, bus: SimCan, now: _Reading) -> RobotBusFigures:
         before = self._readings[0]
         span, bit = _span(before, now), bus.bus.bit / SECOND
         frames, occupied, _ = (count - old for count, old in zip(now.bus, before.bus, strict=True))
         all_frames, all_occupied, errors = (count - old for count, old in zip(now.bus, self._began.bus, strict=True))
         mean = all_occupied * bit / _span(self._began, now)
-        return BusFigures(occupied * bit / span, frames / span, all_frames, errors, *self._slots(), mean)
+        return RobotBusFigures(occupied * bit / span, frames / span, all_frames, errors, *self._slots(), mean)
 
     def _slots(self) -> tuple[float, int]:
         """Return the reserved slots per cycle, and the slots of a cycle."""

@@ -162,7 +162,7 @@ class Play(_Request, tag="play"):
     rate: float = 1.0
 
 
-class Timeline(_Request, tag="timeline"):
+class ReadTimeline(_Request, tag="timeline"):
     """Answer with what happened in a recording: {"start", "end", "events": [...], "misses": [...], "topics": {...}}."""
 
 
@@ -183,7 +183,7 @@ DashRequest = (
     | OrderModule
     | Seek
     | Play
-    | Timeline
+    | ReadTimeline
 )
 
 _decoder = msgspec.json.Decoder(DashRequest)
