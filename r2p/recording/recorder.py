@@ -26,6 +26,7 @@ from r2p.log_lines import get_logger
 from r2p.messages import Message
 from r2p.modules.module import Module
 from r2p.modules.runner import saving
+from r2p.monitoring.topic_types import TypeFinder
 from r2p.names import RESERVED, topic_name
 from r2p.recording.background_writer import BackgroundWriter
 from r2p.recording.entries import BagEntry, MessageEntry, MetadataEntry
@@ -33,7 +34,7 @@ from r2p.recording.format import LATCHED
 from r2p.recording.messages import LOSSES, TOPICS_MAX, RecorderLosses, TopicLosses
 from r2p.recording.observations import Observations
 from r2p.recording.recording_files import RecordingOptions
-from r2p.recording.topics import RecordedTopic, TypeFinder
+from r2p.recording.topics import RecordedTopic
 from r2p.runtime.node import Node
 from r2p.runtime.queues import Pulse
 from r2p.runtime.topic import Topic

@@ -9,19 +9,14 @@ A publisher that starts again may have another type. It counts its messages anew
 when something has changed in discovery.
 """
 
-import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import msgspec
 
 from r2p.codecs.management import ANY_TYPE
-from r2p.errors import Error
-from r2p.messages import Message, layout
-from r2p.modules.module import Module
-from r2p.msg import Log
-from r2p.names import LOG
+from r2p.messages import Message
+from r2p.monitoring.topic_types import UNANNOUNCED, TypeFinder
 from r2p.recording.entries import BagEntry, SampleEntry
-from r2p.ros.classes import standard_classes
 from r2p.runtime.immediate import ImmediateSubscriber
 from r2p.runtime.node import Node
 from r2p.runtime.sample import PublisherClass, Sample, Source
@@ -34,61 +29,6 @@ HELD_BYTES = 16 << 20
 
 PUBLISHERS_MAX = 1024
 """Publishers of one topic that are recorded under their names; those that come after them have none."""
-
-_ASKED_AGAIN = 10 * SECOND  # ns after a question for a type that found none
-_UNANNOUNCED: Mapping[str, type[Message]] = {LOG: Log}
-"""The types of r2p's own topics, for firmware, which announces none."""
-
-
-class TypeFinder:
-    """Finds the class of a publisher's messages."""
-
-    def __init__(self, module: Module, stated: Mapping[str, type[Message]]) -> None:
-        """`stated`: the types of topics that win over what publishers announce."""
-        self.module = module
-        self._stated = stated
-        self._known: dict[bytes, type[Message]] = {}
-        self._asking: dict[tuple[bytes, str], asyncio.Task[type[Message] | None]] = {}
-        self._asked_at: dict[tuple[bytes, str], int] = {}
-
-    def stated(self, topic: str) -> type[Message] | None:
-        """Return the type that the user states."""
-        return self._stated.get(topic)
-
-    def known(self, fingerprint: bytes) -> type[Message] | None:
-        """Return a class with this fingerprint that is known here."""
-        if not self._known:
-            classes = [*self._stated.values(), *standard_classes().values()]
-            self._known = {layout(cls).fingerprint: cls for cls in reversed(classes)}
-        return self._known.get(fingerprint)
-
-    def ask(self, fingerprint: bytes, topic: str, done: Callable[[], None]) -> bool:
-        """Ask other modules for a type, and call `done` when they have answered. False: they were asked just now."""
-        key, now = (fingerprint, topic), self.module.space.clock.monotonic()
-        task = self._asking.get(key)
-        if task is None:
-            if now - self._asked_at.get(key, -_ASKED_AGAIN) < _ASKED_AGAIN:
-                return False
-            self._asked_at[key] = now
-            task = self._asking[key] = asyncio.create_task(self._ask(*key), name=f"type of {topic}")
-        task.add_done_callback(lambda _task: done())
-        return True
-
-    async def _ask(self, fingerprint: bytes, topic: str) -> type[Message] | None:
-        try:
-            found = await self.module.network.message_type(fingerprint, topic)
-            if found is not None:
-                self._known[fingerprint] = found
-        except Error:  # the module was closed meanwhile
-            return None
-        finally:
-            del self._asking[fingerprint, topic]
-        return found
-
-    def close(self) -> None:
-        """Ask no more."""
-        for task in list(self._asking.values()):
-            task.cancel()
 
 
 class RecordedPublisher(msgspec.Struct, eq=False):
@@ -192,9 +132,9 @@ class RecordedTopic:
         if own is not None and (not source.link or fingerprint in (own.fingerprint, ANY_TYPE)):
             publisher.cls = own.cls
         elif fingerprint == ANY_TYPE:
-            publisher.cls = _UNANNOUNCED.get(self.name)
+            publisher.cls = UNANNOUNCED.get(self.name)
         else:
-            publisher.cls = self._types.known(fingerprint)
+            publisher.cls = self._types.by_fingerprint(fingerprint)
             if publisher.cls is None and self._types.ask(fingerprint, self.name, lambda: self._answered(publisher)):
                 publisher.held = publisher.held or []
                 publisher.held_since = self._space.clock.monotonic()
@@ -204,7 +144,7 @@ class RecordedTopic:
 
     def _answered(self, publisher: RecordedPublisher) -> None:
         if publisher.cls is None:
-            publisher.cls = self._types.known(publisher.fingerprint)
+            publisher.cls = self._types.by_fingerprint(publisher.fingerprint)
         self._release(publisher)
 
     def review(self) -> None:
