@@ -17,6 +17,7 @@ test: $(STAMP) system
 
 # The tests with the lowest versions that pyproject.toml allows; `make test-lowest TESTS=tests/tools` runs some of them.
 test-lowest: $(LOWEST)/stamp system
+	$(if $(CI)$(PEERS),@$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --group browser)
 	$(LOWEST)/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS)
 
 # The tests with other Pythons, of those that this machine has: `make test-pythons PYTHONS=3.13 TESTS=tests/tools`.
@@ -28,6 +29,7 @@ test-python-%: $(BIN)/uv system
 	@export PYENV_VERSION=$$(pyenv versions --bare 2>/dev/null | paste -sd :); \
 	if $(BIN)/uv python find --quiet --no-python-downloads $* >/dev/null 2>&1; then \
 		$(MAKE) --no-print-directory .venv-$*/stamp && \
+		$(if $(CI)$(PEERS),$(BIN)/uv pip install --quiet --python .venv-$* --group browser &&) \
 		.venv-$*/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS); \
 	else echo "Python $* is not on this machine: skipped"; fi
 
@@ -94,8 +96,9 @@ $(LOWEST)/stamp: pyproject.toml
 	touch $@
 
 # What the tests use of the system: installed for root, unpacked for others, else they say what they skip. Real ROS 2
-# takes 275 MB: it is installed with CI=1 or PEERS=1.
+# takes 275 MB, a browser 600 MB: they are installed with CI=1 or PEERS=1.
 .PHONY: system
 system: $(STAMP)
 	@$(BIN)/python -m tests.debian
 	@$(BIN)/python -m tests.ros.rclpy.install
+	@$(BIN)/python -m tests.browser.install

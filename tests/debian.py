@@ -38,7 +38,7 @@ def get() -> str:
         if shutil.which("apt-get") is None:
             return missing
         if os.geteuid() == 0 and (missing or not all(map(shutil.which, SHELLS))):
-            _install()
+            install(*_ALL, *SHELLS)
         elif missing:
             _unpack()
     except subprocess.CalledProcessError as error:
@@ -47,8 +47,9 @@ def get() -> str:
     return problems()
 
 
-def _install() -> None:
-    command = ("apt-get", "install", "--quiet", "--yes", "--no-install-recommends", *_ALL, *SHELLS)
+def install(*packages: str) -> None:
+    """Install packages, as root. Raises CalledProcessError."""
+    command = ("apt-get", "install", "--quiet", "--yes", "--no-install-recommends", *packages)
     try:
         _run(*command)
     except subprocess.CalledProcessError:  # most often the lists are old, or were never there
