@@ -19,6 +19,14 @@ News:
                 "sent": n, "running": bool, "error"?: why it has ended}
     dropped     {"op": "dropped", "streams": {NAME: n}}: what this page was too slow for, in all
     clock       of a recording: {"op": "clock", "time": ns, "playing": true, "rate": 1.0}
+    plotted     of a recording, after points: {"op": "plotted", "stream": n, "share": how much of it is read, 0 to 1,
+                "messages": n, "undecodable": n}
+    timeline    of a recording that is read through: {"op": "timeline", "share": 0 to 1, "events": [{"time", "kind",
+                "about", "text", "count", "late", "until"}, ...], "misses": [[TOPIC, KIND, step, count], ...], "gaps":
+                [[TOPIC, start, end], ...], "left_out": n, "damaged": n}: what was found since the last one
+
+Of a recording, points replace all earlier ones of their stream: the first ones are coarse. Its `hello` has `recording`
+true. With {"cleared": true}, the records of a `log` replace all before them, as its time has changed.
 
 Points, little-endian: u8 1, u8 number of columns, u16 stream, u32 number of points, f64 times (s, UTC), then f64 values
 of the first column, of the second one, ... NaN: the message had no value there.
@@ -163,7 +171,10 @@ class Play(_Request, tag="play"):
 
 
 class ReadTimeline(_Request, tag="timeline"):
-    """Answer with what happened in a recording: {"start", "end", "events": [...], "misses": [...], "topics": {...}}."""
+    """Answer with what is in a recording, and send what happened as news, while it is found.
+
+    {"start": ns, "end": ns, "step": ns of a step of misses, "files": [...], "problems": [...], "topics": {NAME: count}}
+    """
 
 
 DashRequest = (
