@@ -9,6 +9,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 NOTICES = "THIRD-PARTY-NOTICES.md"
 
 _NAME = re.compile(r"[A-Za-z0-9-]+")
+_VERSION = re.compile(r"\(v([0-9.]+)\)")
 _ROW = re.compile(r"^\| \[([a-z0-9-]+)\]\(https://[^)]+\) \| ([^|]*\S) \| ([^|]*\S) \|$", re.MULTILINE)
 
 
@@ -24,7 +25,18 @@ def test_every_dependency_has_a_notice() -> None:
 
 
 def test_the_wheel_takes_them_along() -> None:
-    assert PROJECT["license-files"] == ["LICENSE", NOTICES]
+    assert PROJECT["license-files"] == ["LICENSE", NOTICES, "r2p/web/page/vendor/*/LICENSE"]
+
+
+def test_what_the_page_contains_has_its_licence_there() -> None:
+    notices = (ROOT / NOTICES).read_text()
+    contained = [each for each in (ROOT / "r2p/web/page/vendor").iterdir() if each.is_dir()]
+    assert contained
+    for folder in contained:
+        assert f"`{folder.relative_to(ROOT)}`" in notices
+        assert (folder / "LICENSE").read_text().strip() in notices
+        versions = {found for each in folder.glob("*.js") for found in _VERSION.findall(each.read_text()[:100])}
+        assert [each for each in versions if f"{folder.name} {each}" in notices.lower()] == list(versions) != []
 
 
 def test_every_dependency_has_a_lower_bound() -> None:

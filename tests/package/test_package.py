@@ -47,7 +47,9 @@ def test_the_wheel_has_the_package_and_nothing_else(wheel: Path) -> None:
         names = archive.namelist()
     assert {name.partition("/")[0].partition("-")[0] for name in names} == {"r2p"}
     code = {str(each.relative_to(ROOT)) for each in (ROOT / "r2p").rglob("*.py")}
-    assert {*code, "r2p/py.typed"} == {name for name in names if name.startswith("r2p/")}
+    page = {str(each.relative_to(ROOT)) for each in (ROOT / "r2p/web/page").rglob("*") if each.is_file()}
+    assert {*code, *page, "r2p/py.typed"} == {name for name in names if name.startswith("r2p/")}
+    assert any(name.endswith(".dist-info/licenses/r2p/web/page/vendor/uplot/LICENSE") for name in names)
     assert {Path(name).name for name in names} > {"entry_points.txt", "LICENSE", "THIRD-PARTY-NOTICES.md"}
 
 
@@ -62,7 +64,7 @@ def test_the_sdist_has_what_its_makefile_uses(tmp_path: Path) -> None:
 
 def test_the_metadata_is_complete(metadata: Message) -> None:
     assert metadata["Author"] == "The r2p developers"
-    assert metadata["License-Expression"] == "BSD-2-Clause"
+    assert metadata["License-Expression"] == "BSD-2-Clause AND MIT"
     assert metadata["Requires-Python"] == ">=3.11"
     assert "Typing :: Typed" in metadata.get_all("Classifier", [])
     assert not metadata.get_all("Project-URL")
