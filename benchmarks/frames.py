@@ -1,6 +1,5 @@
 """CAN frames into a recording: as fast as they can be written, and from vcan in a user-mode Linux kernel."""
 
-import json
 import sys
 import tempfile
 import time
@@ -9,7 +8,7 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from benchmarks.socketcan import BUSY
+from benchmarks.socketcan import BUSY, measured_inside
 from benchmarks.table import Row, rate, typical
 from r2p.codecs.can_bits import EXTENDED, LOCAL, WireFrame
 from r2p.recording.bag import Bag
@@ -17,7 +16,7 @@ from r2p.recording.entries import EntryWriter
 from r2p.recording.frame_reader import BusReader
 from r2p.recording.frames import BusInfo, FrameEntry
 from r2p.recording.writer import CHUNK_SIZE, BagWriter
-from tests.uml import kernel, packages
+from tests.uml import packages
 
 BATCH = 64
 BATCHES = 1500
@@ -25,8 +24,6 @@ RUNS = 3
 
 _BUS = BusInfo("can0", "rtcan:can0")
 _UTC = 1_700_000_000_000_000_000
-_LIMIT = 300.0  # seconds
-_RESULTS = "results"
 
 
 def rows() -> Iterator[Row]:
@@ -98,13 +95,7 @@ def frames_read(bag: Bag) -> float:
 
 
 def from_vcan(tools: packages.Tools) -> Iterator[Row]:
-    with kernel.folder() as shared:
-        results = shared / _RESULTS
-        command = [sys.executable, "-m", "benchmarks.frames_inside", str(results)]
-        kernel.run(tools, shared, command, cwd=Path(__file__).parents[1], environment={}, limit=_LIMIT)
-        if not results.exists():
-            raise kernel.KernelFailed(kernel.tail(shared))
-        found: dict[str, float] = json.loads(results.read_text(encoding="ascii"))
+    found = measured_inside(tools, "benchmarks.frames_inside")
     sent, recorded, lost = found["sent"], found["recorded"], found["lost"]
     yield Row(
         f"r2p bag record --frames, cangen -g 0, {found['seconds']:.0f} s (in UML)",

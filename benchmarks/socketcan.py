@@ -20,13 +20,7 @@ def rows() -> Iterator[Row]:
     if isinstance(tools, str):
         print(f"SocketCAN is left out: {tools}", file=sys.stderr)
         return
-    with kernel.folder() as shared:
-        results = shared / _RESULTS
-        command = [sys.executable, "-m", "benchmarks.socketcan_inside", str(results)]
-        kernel.run(tools, shared, command, cwd=Path(__file__).parents[1], environment={}, limit=_LIMIT)
-        if not results.exists():
-            raise kernel.KernelFailed(kernel.tail(shared))
-        found: dict[str, float] = json.loads(results.read_text(encoding="ascii"))
+    found = measured_inside(tools, "benchmarks.socketcan_inside")
     bare, notifier = found["bare"], found["notifier"]
     for loop in ("uvloop", "asyncio"):
         ours = found[loop]
@@ -44,3 +38,15 @@ def rows() -> Iterator[Row]:
         "30 %",
         BUSY / found["asyncio"] < 0.3,
     )
+
+
+def measured_inside(tools: packages.Tools, module: str) -> dict[str, float]:
+    """Run a module in the kernel, and return what it has written to the file that its argument names, as JSON."""
+    with kernel.folder() as shared:
+        results = shared / _RESULTS
+        command = [sys.executable, "-m", module, str(results)]
+        kernel.run(tools, shared, command, cwd=Path(__file__).parents[1], environment={}, limit=_LIMIT)
+        if not results.exists():
+            raise kernel.KernelFailed(kernel.tail(shared))
+        found: dict[str, float] = json.loads(results.read_text(encoding="ascii"))
+        return found

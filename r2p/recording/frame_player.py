@@ -9,8 +9,7 @@ bus where RTCAN is spoken is refused, unless the caller wants it `anyway`.
 """
 
 import asyncio
-import contextlib
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
 from types import TracebackType
 from typing import Final, Self
@@ -25,7 +24,7 @@ from r2p.recording.pacing import PacedStream, Pacer
 from r2p.sim.can import CanNode, ControllerState, ErrorKind
 from r2p.sim.transport import SimCan, SimPort
 from r2p.sim.transport import from_url as sim_from_url
-from r2p.transports.can.sending import FrameSender, open_sender
+from r2p.transports.can.sending import FrameSender, QueuedSender, open_sender
 from r2p.transports.rtcan.transport import from_url as rtcan_from_url
 from r2p.transports.url import parse
 from r2p.units import MILLISECOND, SECOND
@@ -36,7 +35,6 @@ LISTEN: Final = 0.7
 _NODE: Final = "play"
 _FRAME_BYTES: Final = 200  # of memory
 _LEAD: Final = MILLISECOND  # ns: a simulated frame starts before the instant under which it was recorded, its end
-_CLOSE_S: Final = 2.0  # seconds for the last frames
 _RTCAN: Final = (FrameKind.SYNC, FrameKind.MANAGEMENT)
 
 
@@ -165,7 +163,7 @@ async def _rtcan_on(monitor: BusMonitor) -> str:
     return ""
 
 
-class SimulatedSender(FrameSender):
+class SimulatedSender(QueuedSender[Frame]):
     """Sends to a simulated bus, as one more node, one frame after the other."""
 
     def __init__(self, can: SimCan) -> None:
@@ -176,9 +174,6 @@ class SimulatedSender(FrameSender):
         controller.on_sent = self._on_sent
         controller.on_error = self._on_error
         controller.on_state = self._on_state
-        self._waiting: deque[Frame] = deque()
-        self._empty = asyncio.Event()
-        self._empty.set()
 
     def send(self, frame: WireFrame) -> None:
         flags = frame[0] & ~IDENTIFIER_MASK
@@ -210,10 +205,6 @@ class SimulatedSender(FrameSender):
 
     async def aclose(self) -> None:
         try:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(_CLOSE_S):
-                    await self._empty.wait()
+            await self._drain("no node acknowledged them")
         finally:
-            if self._waiting:
-                self.refused["no node acknowledged them"] += len(self._waiting)
             self._can.unplug(self._controller)

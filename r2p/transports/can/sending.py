@@ -14,11 +14,13 @@ import socket
 import struct
 from collections import Counter, deque
 from functools import partial
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from r2p.codecs.can_bits import ERROR, EXTENDED, FRAME_MAX, IDENTIFIER_MASK, REMOTE, WireFrame
 from r2p.errors import TransportError
 from r2p.transports.can import netlink, pythoncan
+
+F = TypeVar("F")
 
 QUEUE_MAX = 8192
 """Frames that wait for the interface, at most: a second of a saturated bus."""
@@ -70,7 +72,27 @@ async def open_sender(interface: str, channel: str, bitrate: int) -> FrameSender
     return sender
 
 
-class SocketCanSender(FrameSender):
+class QueuedSender(FrameSender, Generic[F]):
+    """A sender with a queue of its own: frames as its interface takes them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting: deque[F] = deque()
+        self._empty = asyncio.Event()
+        self._empty.set()
+
+    async def _drain(self, reason: str) -> None:
+        """Wait until the queue is empty, but not for ever; what is left then is refused for this reason."""
+        try:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_CLOSE_S):
+                    await self._empty.wait()
+        finally:
+            if self._waiting:
+                self.refused[reason] += len(self._waiting)
+
+
+class SocketCanSender(QueuedSender[bytes]):
     """Sends to an interface of Linux."""
 
     def __init__(self, name: str) -> None:
@@ -82,9 +104,6 @@ class SocketCanSender(FrameSender):
             raise TransportError(f"rtcan:{name}: {why}")
         self._name = name
         self._loop = asyncio.get_running_loop()
-        self._waiting: deque[bytes] = deque()
-        self._empty = asyncio.Event()
-        self._empty.set()
         self._timer: asyncio.TimerHandle | None = None
         self._error: OSError | None = None
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
@@ -122,12 +141,8 @@ class SocketCanSender(FrameSender):
 
     async def aclose(self) -> None:
         try:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(_CLOSE_S):
-                    await self._empty.wait()
+            await self._drain("the interface did not take them")
         finally:
-            if self._waiting:
-                self.refused["the interface did not take them"] += len(self._waiting)
             if self._timer is not None:
                 self._timer.cancel()
             self._socket.close()
