@@ -98,12 +98,16 @@ class NetworkView:
         """List the modules, this one first, then by name; observers included."""
         module = self._opened()
         now = module.space.clock.monotonic()
+        own = self._own_view(module)
+        others = [_module_view(link, info, now) for link in module.links for info in link.discovery.modules.values()]
+        return [own, *sorted(others, key=lambda view: (view.name, view.link))]
+
+    def _own_view(self, module: LinkManager) -> ModuleView:
         state = _state(module.flags, observer=module.observer)
         rebooted = bool(module.flags & FLAG_REBOOTED)
         own = ModuleView(module.space.module, state, rebooted, 0.0, "", module.instance, WIRE_VERSION, __version__)
         own.has_loader = bool(module.flags & FLAG_LOADER)
-        others = [_module_view(link, info, now) for link in module.links for info in link.discovery.modules.values()]
-        return [own, *sorted(others, key=lambda view: (view.name, view.link))]
+        return own
 
     def topics(self) -> dict[str, TopicView]:
         """Return the topics by name, in order."""
@@ -266,8 +270,13 @@ class NetworkView:
         view = self._view(module)
         return None if view is None else view.instance
 
-    def _view(self, module: str) -> ModuleView | None:
-        found = (each for each in self.modules() if each.name == module)
+    def _view(self, name: str) -> ModuleView | None:
+        module = self._opened()
+        if name == module.space.module:
+            return self._own_view(module)
+        now = module.space.clock.monotonic()
+        infos = ((link, link.discovery.modules.get(name)) for link in module.links)
+        found = [_module_view(link, info, now) for link, info in infos if info is not None]
         return min(found, key=lambda each: (each.kind == "ROS", each.age), default=None)  # it may be seen as both
 
 

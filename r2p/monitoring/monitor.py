@@ -1,113 +1,186 @@
 """Collects the figures of a module's network once a second."""
 
 import asyncio
+import functools
 from types import TracebackType
 from typing import Self
 
 from r2p.codecs.services import is_of_service
-from r2p.errors import Closed
-from r2p.modules.graph import Endpoint, ModuleView, TopicView
+from r2p.errors import Closed, InvalidName
+from r2p.log_lines import get_logger
+from r2p.modules.graph import TopicView
 from r2p.modules.module import Module
-from r2p.monitoring.snapshot import (
-    ModuleFigures,
-    NetworkSnapshot,
-    NodeFigures,
-    PublisherFigures,
-    SubscriberFigures,
-    TopicFigures,
+from r2p.modules.statistics import ModuleStatistics
+from r2p.monitoring.buses import BusTables
+from r2p.monitoring.counters import ModuleCounters
+from r2p.monitoring.measuring import MeasuredTopic
+from r2p.monitoring.polling import can_be_asked, poll_statistics
+from r2p.monitoring.rows import (
+    FigureSources,
+    TopicRows,
+    keep_equal,
+    link_rows,
+    module_rows,
+    service_rows,
 )
-from r2p.runtime.sample import PublisherClass
+from r2p.monitoring.snapshot import NetworkSnapshot, TopicFigures
+from r2p.monitoring.topic_types import TypeFinder
+from r2p.names import RESERVED, topic_name
+from r2p.runtime.node import Node
+from r2p.units import SECOND
 
-_CLASS_NAMES = {
-    PublisherClass.PERIODIC: "periodic",
-    PublisherClass.SPORADIC: "sporadic",
-    PublisherClass.NON_REAL_TIME: "non real-time",
-}
+TOPICS_MAX = 10_000
+"""Topics that a snapshot has: more are counted, and left out."""
+
+_NODE = "monitor"
+_MODULES_MAX = 256  # modules that are asked: their names come from the network
+_ENTRIES_MAX = 50_000  # entries that are kept of all answers
+_AT_ONCE = 200  # topics in one turn of the event loop
+_SHARE = 20  # times as long as collecting takes, it rests: a network of any size takes a twentieth of the loop
+
+logger = get_logger("r2p.monitoring")
 
 
 class NetworkMonitor:
     """Collects figures while its block is open: `snapshot` is the newest, and `changed()` waits for the next one.
 
-    It takes its turn in the event loop once each `period` (s), whatever the number of topics.
+    Modules are asked for their statistics each `period` (s), and less often where answers are slow. Collecting takes
+    short turns in the event loop, whatever the number of topics.
     """
 
-    def __init__(self, module: Module, *, period: float = 1.0) -> None:
+    def __init__(self, module: Module, *, period: float = 1.0, types: TypeFinder | None = None) -> None:
+        """`types`: those that a tool knows or uses itself."""
         self.snapshot = NetworkSnapshot(time=0)
         """The newest figures."""
+        self.types = types or TypeFinder(module)
+        """Finds the message classes of topics."""
         self._module = module
+        self._clock = module.space.clock
         self._period = period
         self._changed = asyncio.Event()
+        self._node = Node(_NODE, module.space)
+        self._sources = FigureSources(BusTables(module, self._node), self.types)
+        self._topic_rows = TopicRows(self._sources)
+        self._polls: dict[str, asyncio.Task[None]] = {}
 
     async def __aenter__(self) -> Self:
         """Begin to collect. Raises Closed if the module is not open."""
-        self._collect()
+        await self._collect()
         self._task = asyncio.create_task(self._run(), name=f"{self._module.name} monitor")
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._task.cancel()
-        await asyncio.wait([self._task])
+        tasks = [self._task, *self._polls.values()]
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+        self._sources.buses.close()
+        for measured in self._sources.measured.values():
+            measured.close()
+        self._sources.measured.clear()
+        self._node.close()
+        self.types.close()
 
     async def changed(self) -> NetworkSnapshot:
         """Wait for the next figures, and return them."""
         await self._changed.wait()
         return self.snapshot
 
+    # Measured topics
+
     def measure(self, topic: str) -> None:
-        """Subscribe to a topic, to know its rate, latency and losses. Raises InvalidName and NameTooLong."""
-        raise NotImplementedError(topic)
+        """Subscribe to a topic, to know its rate, latency and losses; as often as `stop_measuring` is called later.
+
+        Raises InvalidName and NameTooLong for a name that no topic can have.
+        """
+        if topic in RESERVED:
+            raise InvalidName(f"topic {topic} has messages of r2p itself, which can't be measured")
+        measured = self._sources.measured.get(topic)
+        if measured is None:
+            known = any(topic in link.discovery.topics for link in self._module.links)
+            name = topic if known else topic_name(topic)
+            measured = self._sources.measured[topic] = MeasuredTopic(self._module, self._node, name)
+            measured.open()
+        measured.users += 1
 
     def stop_measuring(self, topic: str) -> None:
-        """End the subscription to a topic that is measured."""
-        raise NotImplementedError(topic)
+        """End the subscription to a measured topic, if nothing else has asked for it."""
+        measured = self._sources.measured.get(topic)
+        if measured is None:
+            return
+        measured.users -= 1
+        if not measured.users:
+            del self._sources.measured[topic]
+            measured.close()
+
+    # Once each period
 
     async def _run(self) -> None:
+        took = 0.0
         while True:
-            await asyncio.sleep(self._period)
+            await asyncio.sleep(max(self._period, _SHARE * took))
+            started = self._clock.monotonic()
             try:
-                self._collect()
+                await self._collect()
             except Closed:
                 return
+            except Exception as error:
+                logger.error("internal error, please report it: figures are missing", exc_info=error)
+            took = (self._clock.monotonic() - started) / SECOND
 
-    def _collect(self) -> None:
-        network = self._module.network
-        views = network.topics()
-        nodes = network.nodes()
+    async def _collect(self) -> None:
+        network, sources = self._module.network, self._sources
+        for measured in sources.measured.values():
+            measured.report()
+        buses = sources.buses.look()
+        modules = network.modules()
+        self._poll({view.name for view in modules if can_be_asked(view)})
+        topics = network.topics()
+        left_out = max(0, len(topics) - TOPICS_MAX)
+        if left_out:
+            topics = dict(list(topics.items())[:TOPICS_MAX])
+        sources.sum_up(topics)
+        before = self.snapshot
         self.snapshot = NetworkSnapshot(
-            time=self._module.space.clock.now(),
+            time=self._clock.now(),
             network=", ".join(link.name for link in self._module.links),
-            modules=[_module(view, nodes) for view in network.modules()],
-            topics=[_topic(view, is_of_service=is_of_service(name, views)) for name, view in views.items()],
+            modules=keep_equal(before.modules, module_rows(modules, topics, sources)),
+            topics=await self._collect_topics(topics),
+            services=keep_equal(before.services, service_rows(topics, sources, self._topic_rows)),
+            links=keep_equal(before.links, link_rows(sources.counters)),
+            buses=keep_equal(before.buses, buses),
+            topics_left_out=left_out,
         )
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
 
+    async def _collect_topics(self, topics: dict[str, TopicView]) -> list[TopicFigures]:
+        """Return the rows of topics, in several turns of the event loop."""
+        before = {row.name: row for row in self.snapshot.topics}
+        rows: list[TopicFigures] = []
+        for view in topics.values():
+            row = self._topic_rows.row(view, is_of_service=is_of_service(view.name, topics))
+            known = before.get(view.name)
+            rows.append(row if known is None or known != row else known)
+            if len(rows) % _AT_ONCE == 0:
+                await asyncio.sleep(0)
+        return rows
 
-def _module(view: ModuleView, nodes: dict[tuple[str, str], tuple[list[str], list[str]]]) -> ModuleFigures:
-    own = [NodeFigures(node, None, None, *topics) for (module, node), topics in nodes.items() if module == view.name]
-    return ModuleFigures(
-        view.name, view.state, view.kind, view.age, view.link, view.release, rebooted=view.rebooted, nodes=own
-    )
+    # Statistics
 
+    def _poll(self, names: set[str]) -> None:
+        """Begin to ask new modules, and stop asking those that have left."""
+        for name in self._polls.keys() - names:
+            self._polls.pop(name).cancel()
+            del self._sources.counters[name]
+        for name in sorted(names - self._polls.keys())[: _MODULES_MAX - len(self._polls)]:
+            counters = self._sources.counters[name] = ModuleCounters()
+            on_answer = functools.partial(self._answered, name, counters)
+            polling = poll_statistics(self._module, name, self._period, on_answer, counters.silence)
+            self._polls[name] = asyncio.create_task(polling, name=f"monitor asks {name}")
 
-def _topic(view: TopicView, *, is_of_service: bool) -> TopicFigures:
-    return TopicFigures(
-        view.name,
-        type=view.layout.name if view.layout else view.ros_type or None,
-        size=view.size or None,
-        varies=view.varies,
-        mismatch=view.mismatch,
-        age=view.age,
-        publishers=[_publisher(each) for each in view.publishers],
-        subscribers=[SubscriberFigures(each.module, each.node, each.link) for each in view.subscribers],
-        is_of_service=is_of_service,
-    )
-
-
-def _publisher(endpoint: Endpoint) -> PublisherFigures:
-    klass = endpoint.publisher_class
-    return PublisherFigures(
-        endpoint.module, endpoint.node, endpoint.link, None if klass is None else _CLASS_NAMES[klass]
-    )
+    def _answered(self, name: str, counters: ModuleCounters, statistics: ModuleStatistics) -> None:
+        others = sum(each.entries for each in self._sources.counters.values() if each is not counters)
+        counters.update(name, statistics, _ENTRIES_MAX - others)

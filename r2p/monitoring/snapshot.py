@@ -169,7 +169,11 @@ class ServiceFigures(Figures):
 
 
 class NetworkSnapshot(Figures):
-    """All figures at `time` (UTC, ns). `network` names the links of this tool."""
+    """All figures at `time` (UTC, ns). `network` names the links of this tool.
+
+    A row that is as in the snapshot before is the same object. `topics_left_out` counts those beyond the most topics
+    that a snapshot has.
+    """
 
     time: int
     network: str = ""
@@ -178,3 +182,4 @@ class NetworkSnapshot(Figures):
     services: list[ServiceFigures] = msgspec.field(default_factory=list)
     links: list[LinkFigures] = msgspec.field(default_factory=list)
     buses: list[BusFigures] = msgspec.field(default_factory=list)
+    topics_left_out: int = 0

@@ -1,8 +1,7 @@
 """What a recorder asks of one module: its statistics, once a second, and its parameters with their changes.
 
-Each module has tasks of its own, so a slow or silent one delays no other. A slow one is asked less often. On RTCAN, on
-serial lines, and behind gateways, answers take capacity from the robot: there a module whose answer takes longer than
-5 ms is asked less often than once a second, and each 10 s if it takes 50 ms or more.
+Each module has tasks of its own, so a slow or silent one delays no other. A slow one is asked less often: see
+`QuestionPace`.
 
 The counters of a module only grow, so `growth` is what happened between two answers. A module that ends takes what it
 counted since its last answer with it.
@@ -21,6 +20,7 @@ from r2p.errors import Error
 from r2p.messages import Message
 from r2p.modules.module import Module
 from r2p.modules.statistics import ModuleStatistics
+from r2p.monitoring.polling import PERIOD, RETRY, QuestionPace
 from r2p.parameters.definition import ParameterInfo
 from r2p.recording.messages import (
     EVENTS,
@@ -35,13 +35,8 @@ from r2p.recording.messages import (
     cut,
 )
 
-_PERIOD = 1.0  # s
-_REST = 4  # times as long as an answer took, nothing is asked ...
-_REST_SLOW = 200  # ... where links may be slow, whose capacity is for the robot ...
-_PERIOD_SLOW = 10.0  # s, ... but no longer than this, or than the former
 _COUNT_MAX = (1 << 64) - 1  # sums of what modules say may be greater
 _TOOL = "recorder"  # the name for what `r2p bag record` has lost itself, such as on its link
-_RETRY = 5.0  # s until a module that does not answer is asked again
 
 Parameters = dict[tuple[str, str], ParameterInfo]
 """The parameters of a module, by node and name."""
@@ -61,7 +56,7 @@ class ModuleWatch:
         self._since = since
         self._is_own = name == module.name
         self._is_tool = self._is_own and module.observer
-        self._took = 0.0  # s, the last answer
+        self._pace = QuestionPace(module, name)
         self._silent = False
 
     async def run(self) -> None:
@@ -69,21 +64,6 @@ class ModuleWatch:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._follow_parameters())
             tasks.create_task(self._follow_statistics())
-
-    async def _pause(self, period: float = _PERIOD) -> None:
-        rest = _REST * self._took
-        if not self._is_near():
-            rest = max(rest, min(_REST_SLOW * self._took, _PERIOD_SLOW))
-        await asyncio.sleep(max(period, rest))
-
-    def _is_near(self) -> bool:
-        """Return whether a fast link leads to the module, without a gateway in between."""
-        return self._is_own or any(
-            info.name == self.name and not info.hops
-            for link in self._module.links
-            if link.up and not link.has_slots and link.calls.is_fast
-            for info in link.discovery.modules.values()
-        )
 
     # Statistics
 
@@ -96,10 +76,10 @@ class ModuleWatch:
                 statistics = await self._statistics()
             except (Error, TimeoutError) as error:
                 self._note_silence(str(error))
-                await self._pause(_RETRY)
+                await self._pace.pause(RETRY)
                 continue
             now = self._clock.monotonic()
-            self._took = (now - started) * 1e-9
+            self._pace.took = (now - started) * 1e-9
             self._note_answer()
             if not self._is_tool:  # whose name is a random one
                 self._record(f"{STATISTICS}/{self.name}", statistics)
@@ -110,7 +90,7 @@ class ModuleWatch:
                 for signal in growth(_TOOL if self._is_tool else self.name, before, statistics, own=self._is_own):
                     self._record(SIGNALS, msgspec.structs.replace(signal, interval=interval))
             before, asked_at = statistics, now
-            await self._pause()
+            await self._pace.pause()
 
     async def _statistics(self) -> ModuleStatistics:
         return self._module.statistics() if self._is_own else await self._module.network.statistics(self.name)
@@ -130,11 +110,11 @@ class ModuleWatch:
     async def _follow_parameters(self) -> None:
         while True:
             try:
-                following = self._module.network.follow_parameters(self.name, period=_PERIOD, pause=self._pause)
+                following = self._module.network.follow_parameters(self.name, period=PERIOD, pause=self._pace.pause)
                 async for parameters in following:
                     self._record_changes(parameters)
             except (Error, TimeoutError):  # as its statistics, which say so
-                await self._pause(_RETRY)
+                await self._pace.pause(RETRY)
 
     def _record_changes(self, parameters: Parameters) -> None:
         before = self.parameters or {}

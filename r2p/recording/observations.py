@@ -25,12 +25,12 @@ from typing import Any, Self
 import msgspec
 import tomli_w
 
-from r2p.codecs.own_services import WIRE_MIN
 from r2p.errors import Closed
 from r2p.log_lines import get_logger
 from r2p.messages import Message
 from r2p.modules.graph import ModuleView, NetworkView
 from r2p.modules.module import Module
+from r2p.monitoring.polling import can_be_asked
 from r2p.parameters.definition import ParameterInfo
 from r2p.protocols.discovery.events import Mismatched, ModuleChanged, ModuleGone, NameConflict
 from r2p.recording.bus_watch import BusWatch
@@ -192,7 +192,7 @@ class Observations:
 
     def _watch_modules(self, tasks: asyncio.TaskGroup) -> None:
         """Begin to ask new modules, and stop asking those that have left."""
-        names = {view.name for view in self._module.network.modules() if _answers(view)}
+        names = {view.name for view in self._module.network.modules() if can_be_asked(view)}
         for name in sorted(self._watches.keys() - names):
             watch, task = self._watches.pop(name)
             task.cancel()
@@ -225,13 +225,6 @@ class Observations:
 
     def _attach(self, name: str, media_type: str, data: bytes) -> None:
         self._add(AttachmentEntry(name, media_type, data, self._clock.now()))
-
-
-def _answers(view: ModuleView) -> bool:
-    """Return whether a module can be asked: this one, or a program with r2p that is not a tool."""
-    if not view.link:
-        return True
-    return view.kind == "r2p" and view.state != "observer" and view.wire is not None and view.wire >= WIRE_MIN
 
 
 def event_message(event: ModuleEvent) -> RecordedEvent:

@@ -1,0 +1,266 @@
+"""What one module counts, as its last answers say: totals, and rates between two answers by the module's own clock.
+
+Names, numbers and times come from another module: names are made printable, sums stay within 64 bits, and a clock that
+goes back or is not a number only costs the rates.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
+from typing import TypeVar
+
+import msgspec
+
+from r2p.log_lines import printable
+from r2p.modules.statistics import (
+    LinkStatistics,
+    ModuleStatistics,
+    PublisherStatistics,
+    ReasonCount,
+    ServiceStatistics,
+    SubscriberStatistics,
+)
+from r2p.monitoring.rates import CounterRate
+from r2p.monitoring.snapshot import LinkFigures
+from r2p.names import node_alias, topic_alias
+from r2p.units import MILLISECOND, SECOND
+
+E = TypeVar("E")
+
+COUNT_MAX = (1 << 63) - 1
+"""Sums of what modules say may be greater, which JSON and others can't have."""
+
+_PER_SECOND = MILLISECOND / SECOND
+_NONE: Mapping[str, int] = {}
+
+EndpointName = tuple[str, str]
+"""A node and a topic, by the names that their module has for them."""
+
+
+class PublisherCount(msgspec.Struct, frozen=True):
+    """What a node has published on a topic; `rate` is None until there are two answers."""
+
+    sent: int
+    missed: int
+    late: int
+    rate: float | None
+
+
+class SubscriberCount(msgspec.Struct, frozen=True):
+    """What waits for a node in its subscription of a topic, and what that has lost, by reason."""
+
+    waiting: int
+    lost: Mapping[str, int]
+
+
+class ModuleCounters:
+    """The counters of one module. `answers` is None until it has answered, or has not in time."""
+
+    def __init__(self) -> None:
+        self.answers: bool | None = None
+        self.left_out = 0
+        """Entries of the last answer for which there was no room."""
+        self.entries = 0
+        """Entries that are kept of the last answer."""
+        self.uptime: float | None = None
+        self.cpu: float | None = None
+        """The share of a processor core."""
+        self.publishers: dict[EndpointName, PublisherCount] = {}
+        self.subscribers: dict[EndpointName, SubscriberCount] = {}
+        self.nodes: dict[str, tuple[bool, int]] = {}
+        """Whether each node runs, and how often it was restarted."""
+        self.services: dict[EndpointName, ServiceStatistics] = {}
+        self.links: dict[str, LinkFigures] = {}
+        self.lost: Mapping[str, int] = _NONE
+        """Messages that links, gateways and subscribers of the module have lost, by topic; only those with losses."""
+        self.laxity: Mapping[str, float] = {}
+        """The least time to a deadline (s) by topic."""
+        self._aliases: dict[EndpointName, EndpointName] = {}
+        self._rates: dict[tuple[str, ...], CounterRate] = {}
+        self._time: float | None = None
+        self._processor = math.nan
+
+    def silence(self, _reason: str = "") -> None:
+        """Note that the module does not answer: totals stay, rates are unknown."""
+        self.answers = False
+        self.cpu = None
+        self._rates.clear()
+        self._time = None
+        self.publishers = {key: msgspec.structs.replace(each, rate=None) for key, each in self.publishers.items()}
+        unknown = dict.fromkeys(("sent", "received", "bytes_sent", "bytes_received"))
+        self.links = {key: msgspec.structs.replace(each, **unknown) for key, each in self.links.items()}
+
+    def update(self, module: str, statistics: ModuleStatistics, room: int) -> None:
+        """Enter an answer, of which at most `room` entries are kept."""
+        time = statistics.uptime
+        restarted = self._time is not None and time < self._time
+        if restarted:
+            self._rates.clear()
+            self._time = 0.0
+        self.answers = True
+        self.uptime = time if 0.0 <= time < math.inf else None
+        self._update_processor(statistics, restarted=restarted)
+        limited = _Room(room)
+        before, self._rates = self._rates, {}
+        self._update_links(module, limited.take(statistics.links), before, time)
+        self._update_nodes(statistics, limited)
+        self._update_publishers(limited.take(statistics.publishers), before, time)
+        self._update_subscribers(limited.take(statistics.subscribers))
+        self._update_topics(statistics, limited)
+        self.entries, self.left_out = limited.taken, limited.left_out
+        self._time = time if self.uptime is not None else None
+        self._aliases = {}
+
+    # Look-ups by names that others have for the module's topics
+
+    def publisher(self, module: str, node: str, topic: str) -> PublisherCount | None:
+        """Return the count of a publisher, by the names that this network has for its module, node and topic."""
+        for name in local_names(module, topic):
+            found = self.publishers.get((node, name)) or self.publishers.get(self._by_alias(node, name))
+            if found is not None:
+                return found
+        return None
+
+    def subscriber(self, module: str, node: str, topic: str) -> SubscriberCount | None:
+        """Return the count of a subscriber, by such names."""
+        for name in local_names(module, topic):
+            found = self.subscribers.get((node, name)) or self.subscribers.get(self._by_alias(node, name))
+            if found is not None:
+                return found
+        return None
+
+    def service(self, module: str, node: str, name: str) -> ServiceStatistics | None:
+        """Return the count of a service, by such names."""
+        found = (self.services.get((node, each)) for each in local_names(module, name))
+        return next((each for each in found if each is not None), None)
+
+    def _by_alias(self, node: str, topic: str) -> EndpointName:
+        """Return the full names of an endpoint that is known by its aliases: RTCAN and debug lines carry these."""
+        if not self._aliases:
+            known = {*self.publishers, *self.subscribers}
+            self._aliases = {(node_alias(each), topic_alias(name)): (each, name) for each, name in known}
+        return self._aliases.get((node_alias(node), topic_alias(topic)), ("", ""))
+
+    # Parts of an answer
+
+    def _update_processor(self, statistics: ModuleStatistics, *, restarted: bool) -> None:
+        before, self._processor = 0.0 if restarted else self._processor, statistics.cpu
+        step = math.nan if self._time is None else statistics.uptime - self._time
+        share = (statistics.cpu - before) / step if step > 0.0 else math.nan
+        self.cpu = share if 0.0 <= share < math.inf else None
+
+    def _rate(
+        self, key: tuple[str, ...], time: float, count: int, before: dict[tuple[str, ...], CounterRate]
+    ) -> float | None:
+        rate = before.get(key)
+        if rate is None:
+            start = time if self._time is None else self._time  # an entry that is new since the last answer began at 0
+            rate = CounterRate(start, count if self._time is None else 0)
+        self._rates[key] = rate
+        return rate.add(time, count)
+
+    def _update_publishers(
+        self, entries: Iterable[PublisherStatistics], before: dict[tuple[str, ...], CounterRate], time: float
+    ) -> None:
+        sums: dict[EndpointName, list[int]] = {}
+        for each in entries:
+            known = sums.setdefault((each.node, each.topic), [0, 0, 0])
+            known[0] += each.sent
+            known[1] += each.missed
+            known[2] += each.late
+        self.publishers = {
+            key: PublisherCount(clamp(sent), clamp(missed), clamp(late), self._rate(key, time, sent, before))
+            for key, (sent, missed, late) in sums.items()
+        }
+
+    def _update_subscribers(self, entries: Iterable[SubscriberStatistics]) -> None:
+        self.subscribers = {}
+        for each in entries:
+            counts = ((reason, clamp(getattr(each, name))) for reason, name in _SUBSCRIBER_LOSSES.items())
+            lost = {reason: count for reason, count in counts if count}
+            self.subscribers[each.node, each.topic] = SubscriberCount(each.waiting, lost)
+
+    def _update_nodes(self, statistics: ModuleStatistics, limited: "_Room") -> None:
+        self.nodes = {printable(each.node): (each.running, each.restarts) for each in limited.take(statistics.nodes)}
+        self.services = {(each.node, each.service): each for each in limited.take(statistics.services)}
+
+    def _update_links(
+        self,
+        module: str,
+        entries: Iterable[LinkStatistics],
+        before: dict[tuple[str, ...], CounterRate],
+        time: float,
+    ) -> None:
+        self.links = {}
+        for each in entries:
+            counts = each.sent, each.received, each.bytes_sent, each.bytes_received
+            rates = [self._rate(("link", each.link, f"{i}"), time, count, before) for i, count in enumerate(counts)]
+            row = LinkFigures(module, printable(each.link), each.up, each.ups, each.waiting)
+            row.sent, row.received, row.bytes_sent, row.bytes_received = rates
+            row.lost, row.faults = _reasons(each.lost), _reasons(each.faults)
+            self.links[row.name] = row
+
+    def _update_topics(self, statistics: ModuleStatistics, limited: "_Room") -> None:
+        lost = Counter[str]()
+        laxity: dict[str, float] = {}
+        for each in limited.take(statistics.topics):
+            lost[each.topic] += each.lost
+            if math.isfinite(each.least_laxity):
+                least = each.least_laxity * _PER_SECOND
+                laxity[each.topic] = min(least, laxity.get(each.topic, math.inf))
+        for route in limited.take(statistics.forwarded):
+            lost[route.topic] += route.dropped
+        for (_, topic), count in self.subscribers.items():
+            lost[topic] += sum(count.lost.values())
+        self.lost, self.laxity = +lost, laxity
+
+
+class _Room:
+    """How many entries of an answer are kept."""
+
+    def __init__(self, room: int) -> None:
+        self.taken = self.left_out = 0
+        self._room = room
+
+    def take(self, entries: tuple[E, ...]) -> Iterator[E]:
+        """Iterate over the entries for which there is room."""
+        kept = min(len(entries), max(0, self._room - self.taken))
+        self.taken += kept
+        self.left_out += len(entries) - kept
+        return islice(entries, kept)
+
+
+_SUBSCRIBER_LOSSES = {"queue full": "lost", "undecodable": "undecodable", "too long": "too_long", "stale": "stale"}
+
+
+def clamp(count: int) -> int:
+    """Return a sum of what modules say, within what JSON can have."""
+    return min(count, COUNT_MAX)
+
+
+def _reasons(counts: Iterable[ReasonCount]) -> dict[str, int]:
+    return {printable(each.reason): clamp(each.count) for each in counts}
+
+
+def local_names(module: str, topic: str) -> Iterator[str]:
+    """Yield what a module itself may call a topic of this network: without the prefix that both have here."""
+    namespace, slash, name = module.rpartition("/")
+    if slash and topic.startswith(f"{namespace}/"):
+        yield topic[len(namespace) + 1 :]
+    yield topic
+    if not slash and "_" in name:
+        for position in (i + 1 for i, letter in enumerate(name) if letter == "_"):
+            if topic.startswith(name[:position]):
+                yield topic[position:]
+
+
+def network_name(module: str, topic: str, known: Mapping[str, object]) -> str:
+    """Return what this network calls a topic of a module; `known` has the topics of this network."""
+    namespace, slash, name = module.rpartition("/")
+    if slash:
+        return f"{namespace}/{topic}"
+    if topic in known:
+        return topic
+    prefixed = (name[: i + 1] + topic for i, letter in enumerate(name) if letter == "_")
+    return next((each for each in prefixed if each in known), topic)

@@ -1,0 +1,83 @@
+"""Asks modules for their statistics, each by a task of its own, so a slow or silent one delays no other.
+
+A slow one is asked less often. On RTCAN, on serial lines, and behind gateways, answers take capacity from the robot:
+there a module whose answer takes longer than 5 ms is asked less often than once a second, and each 10 s if it takes
+50 ms or more.
+"""
+
+import asyncio
+from collections.abc import Callable
+
+from r2p.codecs.own_services import WIRE_MIN
+from r2p.errors import Closed, Error
+from r2p.modules.graph import ModuleView
+from r2p.modules.module import Module
+from r2p.modules.statistics import ModuleStatistics
+from r2p.units import SECOND
+
+PERIOD = 1.0
+"""Seconds between two questions, if answers are fast."""
+RETRY = 5.0
+"""Seconds until a module that does not answer is asked again."""
+
+_REST = 4  # times as long as an answer took, nothing is asked ...
+_REST_SLOW = 200  # ... where links may be slow, whose capacity is for the robot ...
+_PERIOD_SLOW = 10.0  # s, ... but no longer than this, or than the former
+
+
+def can_be_asked(view: ModuleView) -> bool:
+    """Return whether a module can be asked: this one, or a program with r2p that is not a tool."""
+    if not view.link:
+        return True
+    return view.kind == "r2p" and view.state != "observer" and view.wire is not None and view.wire >= WIRE_MIN
+
+
+class QuestionPace:
+    """The pace at which one module, this one or another, is asked."""
+
+    def __init__(self, module: Module, name: str) -> None:
+        self.took = 0.0
+        """Seconds that the last answer took."""
+        self._module = module
+        self._name = name
+
+    async def pause(self, period: float = PERIOD) -> None:
+        """Wait until the module may be asked again."""
+        rest = _REST * self.took
+        if not self._is_near():
+            rest = max(rest, min(_REST_SLOW * self.took, _PERIOD_SLOW))
+        await asyncio.sleep(max(period, rest))
+
+    def _is_near(self) -> bool:
+        """Return whether a fast link leads to the module, without a gateway in between."""
+        if self._name == self._module.name:
+            return True
+        for link in self._module.links:
+            known = link.discovery.modules.get(self._name)
+            if known is not None and not known.hops and link.up and not link.has_slots and link.calls.is_fast:
+                return True
+        return False
+
+
+async def poll_statistics(
+    module: Module,
+    name: str,
+    period: float,
+    on_answer: Callable[[ModuleStatistics], None],
+    on_silence: Callable[[str], None],
+) -> None:
+    """Ask a module for its statistics again and again, until cancelled; `on_silence` gets the reason of a failure."""
+    pace, clock = QuestionPace(module, name), module.space.clock
+    while True:
+        started = clock.monotonic()
+        try:
+            statistics = module.statistics() if name == module.name else await module.network.statistics(name)
+        except Closed:
+            return
+        except (Error, TimeoutError) as error:
+            on_silence(str(error))
+            await pace.pause(RETRY)
+            continue
+        pace.took = (clock.monotonic() - started) / SECOND
+        on_answer(statistics)
+        await pace.pause(period)

@@ -1,0 +1,48 @@
+"""Rates of counters that are read about once a second.
+
+A counter of whole messages that is read once a second says 9, 10 or 11 of a topic with 10 Hz. So a rate is the average
+over up to 20 s for as long as the counter grows steadily, to one message; after a change it is that of the last step
+alone.
+"""
+
+_STEP_MIN = 1e-3  # s: two readings closer to each other say nothing
+_STEADY = 1.0 + 1e-6  # messages by which a step may differ from the average
+_SILENT = 2.0  # messages that are overdue: the counter has stopped
+_SPAN = 10.0  # s after which the beginning of the average moves on
+
+
+class CounterRate:
+    """The rate of one counter. `rate` is None until there are two readings."""
+
+    __slots__ = ("_count", "_grown_at", "_middle", "_start", "_time", "rate")
+
+    def __init__(self, time: float, count: int) -> None:
+        """Begin with a reading; `time` in seconds of any clock."""
+        self.rate: float | None = None
+        self._time, self._count, self._grown_at = time, count, time
+        self._start = self._middle = (time, count)
+
+    def add(self, time: float, count: int) -> float | None:
+        """Enter a reading, and return the rate per second.
+
+        A counter that went back was closed and opened anew: it has counted from 0.
+        """
+        step = time - self._time
+        if not _STEP_MIN <= step < float("inf"):  # also not a number: it comes from another module
+            return self.rate
+        if count < self._count:
+            self._count = 0
+            self._start = self._middle = (self._time, 0)
+        elif self.rate is not None and self._has_changed(time, step, count - self._count):
+            self._start = self._middle = (self._time, self._count)
+        if count > self._count:
+            self._grown_at = time
+        if time - self._middle[0] >= _SPAN:
+            self._start, self._middle = self._middle, (self._time, self._count)
+        self._time, self._count = time, count
+        self.rate = (count - self._start[1]) / (time - self._start[0])
+        return self.rate
+
+    def _has_changed(self, time: float, step: float, grown: int) -> bool:
+        rate = self.rate or 0.0
+        return abs(grown - rate * step) > _STEADY or (not grown and rate * (time - self._grown_at) >= _SILENT)
