@@ -161,11 +161,14 @@ class SlotRows:
 
     def __init__(self, bus: str) -> None:
         self.bus = bus
+        self.complete = False
+        """Whether the rows came all at once; else those of one second follow one another."""
         self._source = ""
         self._rows: dict[tuple[str, str], BusSlots] = {}
 
     def replace(self, rows: Iterable[BusSlots]) -> bool:
         """Enter a complete table; return whether it has changed."""
+        self.complete = True
         before, self._rows = self._rows, {(row.topic, row.module): row for row in rows}
         return self._rows != before
 

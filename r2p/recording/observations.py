@@ -170,7 +170,7 @@ class Observations:
             try:
                 self._note_silent_firmware()
                 self._watch_modules(tasks)
-                self._buses.look(tasks)
+                self._buses.look()
                 self._log.look(tasks)
             except Closed:
                 return
