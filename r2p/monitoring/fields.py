@@ -6,6 +6,7 @@ all other bytes; otherwise by a function that is generated for the type and thes
 last of them. Booleans and enums are numbers; an element that an array lacks is NaN.
 """
 
+import itertools
 import math
 import re
 import struct
@@ -15,7 +16,19 @@ from typing import Any, TypeAlias
 import msgspec
 
 from r2p.errors import MessageError
-from r2p.messages import Field, FixedArray, Layout, Message, Nested, Scalar, Shape, VariableArray, VariableText, layout
+from r2p.messages import (
+    Chars,
+    Field,
+    FixedArray,
+    Layout,
+    Message,
+    Nested,
+    Scalar,
+    Shape,
+    VariableArray,
+    VariableText,
+    layout,
+)
 from r2p.messages.shapes import COUNT_SIZE
 from r2p.messages.values import find_field
 
@@ -41,41 +54,51 @@ _TOO_DEEP = (SyntaxError, RecursionError, MemoryError)  # of a compiler that is 
 
 
 class FieldDescription(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A field of a type: `wheels[].speed` is one of each element of an array, an index has to be put into the brackets.
+    """A field of a type. Parts of the elements of an array have [] in their path, where an index has to be put to plot.
 
-    `kind` is that of a schema ("f32", "bool", "str", "char[16]"), and `length` the most elements of the arrays around
-    it, from outside in; `varies`: there may be fewer.
+    `kind` is that of a number ("u8" to "f64"), "bool", "text", or "message", whose parts follow. Of an array it is that
+    of its elements ("array": these are arrays themselves), and it has `length` of them, or `max` at most if that
+    varies. A text has at most `limit` bytes.
     """
 
     path: str
     kind: str
-    plottable: bool
-    length: list[int] = []
-    varies: bool = False
+    length: int | None = None
+    max: int | None = None
+    limit: int | None = None
+    plottable: bool = False
 
 
 def describe_fields(cls: type[Message]) -> list[FieldDescription]:
-    """Return the fields of a type in their order, at most `FIELDS_MAX`."""
-    found: list[FieldDescription] = []
-    for each in _leaves(Nested(layout(cls)), "", [], varies=False):
-        found.append(each)
-        if len(found) == FIELDS_MAX:
-            break
-    return found
+    """Return the fields of a type in their order, and behind a message its parts; at most `FIELDS_MAX`."""
+    return list(itertools.islice(_descriptions(layout(cls).fields, ""), FIELDS_MAX))
 
 
-def _leaves(shape: Shape, path: str, lengths: list[int], *, varies: bool) -> Iterator[FieldDescription]:
+def _descriptions(fields: tuple[Field, ...], before: str) -> Iterator[FieldDescription]:
+    for field in fields:
+        yield from _description(field.shape, before + field.wire_name)
+
+
+def _description(
+    shape: Shape, path: str, length: int | None = None, max: int | None = None
+) -> Iterator[FieldDescription]:
+    """Yield the description of a field, or of the elements of an array of this length, and of its parts."""
+    is_array = length is not None or max is not None
     match shape:
-        case Nested(inner):
-            for field in inner.fields:
-                name = f"{path}.{field.wire_name}" if path else field.wire_name
-                yield from _leaves(field.shape, name, lengths, varies=varies)
+        case FixedArray() | VariableArray() if is_array:
+            yield FieldDescription(path, "array", length, max)
+            yield from _description(shape, f"{path}[]")
         case FixedArray(item, count):
-            yield from _leaves(item, f"{path}[]", [*lengths, count], varies=varies)
+            yield from _description(item, path, length=count)
         case VariableArray(item, limit):
-            yield from _leaves(item, f"{path}[]", [*lengths, limit], varies=True)
-        case _:
-            yield FieldDescription(path, shape.kind, isinstance(shape, Scalar), lengths, varies)
+            yield from _description(item, path, max=limit)
+        case Nested(inner):
+            yield FieldDescription(path, "message", length, max)
+            yield from _descriptions(inner.fields, f"{path}[]." if is_array else f"{path}.")
+        case Chars(limit) | VariableText(limit):
+            yield FieldDescription(path, "text", length, max, limit)
+        case Scalar(kind):
+            yield FieldDescription(path, kind, length, max, plottable=True)
 
 
 class FieldExtractor:
@@ -145,7 +168,11 @@ def _find(outer: Layout[Any], path: str) -> Steps | None:
 
 
 def _not_plottable(shape: Layout[Any], path: str) -> str:
-    names = [each.path for each in describe_fields(shape.cls) if each.plottable]
+    names = [
+        each.path if each.length is None and each.max is None else f"{each.path}[]"
+        for each in describe_fields(shape.cls)
+        if each.plottable
+    ]
     more = f", and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     known = ", ".join(names[:_NAMED]) + more if names else "none at all"
     return f"{shape.name} has no number {path[:_SHOWN]!r}; it has {known}"

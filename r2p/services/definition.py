@@ -13,7 +13,7 @@ import msgspec
 
 from r2p.codecs.services import HEADER_SIZE, REQUESTS, RESPONSES
 from r2p.errors import MessageError
-from r2p.messages import Layout, Message, layout, show, u8, u16, u32
+from r2p.messages import Layout, Message, Nested, layout, show, u8, u16, u32
 from r2p.messages.definition import TYPE_NAME, MessageMeta
 
 Q = TypeVar("Q", bound=Message)
@@ -111,6 +111,15 @@ def define(name: str, request: Any, response: Any = None) -> Definition[Any, Any
     if responses.varies:  # the text of an error takes the place of a response
         responses = msgspec.structs.replace(responses, size=max(responses.size, HEADER_SIZE + TEXT_ROOM))
     return Definition(name, asked, answered, requests, responses)
+
+
+def body_of(cls: type[Message], field: str) -> type[Message] | None:
+    """Return the type of the field of a topic's messages that holds request or response, if it has one."""
+    for each in layout(cls).fields:
+        if each.name == field and isinstance(each.shape, Nested):
+            found: type[Message] = each.shape.layout.cls
+            return found
+    return None
 
 
 def _nested(name: str, service: Any, part: str) -> type[Message]:

@@ -1,28 +1,42 @@
 """`r2p dash`: the network in a browser."""
 
 import asyncio
+import webbrowser
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from r2p.monitoring.monitor import NetworkMonitor
+from r2p.monitoring.topic_types import TypeFinder
 from r2p.tools.output import notify
-from r2p.tools.session import Session, joined
+from r2p.tools.session import Session, UsageError, joined
+from r2p.tools.types import Types
 from r2p.web.dash.assets import page
 from r2p.web.dash.live import LiveSource
 from r2p.web.dash.session import PATH, endpoint
+from r2p.web.dash.source import DashSource
 from r2p.web.server import LOOPBACK, WebOptions, WebServer
 
 PORT = 8080
 
+Host = Annotated[
+    str, typer.Option(help="The address to listen on; all but loopback need the token of the printed link.")
+]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="0: a free one.")]
+
 
 async def dash(
     session: Session,
+    files: Annotated[
+        list[Path] | None, typer.Argument(metavar="FILE...", help="Recordings to show instead of the network.")
+    ] = None,
     *,
-    host: Annotated[
-        str, typer.Option(help="The address to listen on; all but loopback need the token of the printed link.")
-    ] = LOOPBACK,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: a free one.")] = PORT,
+    host: Host = LOOPBACK,
+    port: Port = PORT,
+    open: Annotated[bool, typer.Option("--open", help="Open the page in a browser of this computer.")] = False,
     allow_publish: Annotated[
         bool, typer.Option("--allow-publish", help="Let pages publish and call services.")
     ] = False,
@@ -30,12 +44,47 @@ async def dash(
         bool, typer.Option("--allow-control", help="Let pages set parameters, and stop and start nodes and modules.")
     ] = False,
 ) -> None:
-    """Show the network in a browser, on a page that this command serves."""
-    async with NetworkMonitor(session.module) as monitor:
-        source = LiveSource(session.module, monitor, allow_publish=allow_publish, allow_control=allow_control)
-        async with WebServer(WebOptions(host=host, port=port), {PATH: endpoint(source)}, page()) as server:
-            notify(f"open {server.url} in a browser; Ctrl-C ends")
+    """Show the network in a browser, on a page that this command serves.
+
+    The address is printed. Pages only look, unless an option allows more. Ctrl-C ends it.
+    """
+    if files:
+        raise UsageError("this version of r2p dash shows no recordings: leave out FILE")
+    async with live_source(session, allow_publish=allow_publish, allow_control=allow_control) as source:
+        await serve(session, source, WebOptions(host=host, port=port), open=open)
+
+
+@asynccontextmanager
+async def live_source(session: Session, *, allow_publish: bool, allow_control: bool) -> AsyncIterator[LiveSource]:
+    """Watch the network of a command."""
+    stated = Types(session.settings)
+    finder = TypeFinder(session.module, {topic: cls for topic in session.settings.types if (cls := stated.stated(topic, None))})
+    async with (
+        NetworkMonitor(session.module) as monitor,
+        LiveSource(
+            session.module, monitor, finder, allow_publish=allow_publish, allow_control=allow_control
+        ) as source,
+    ):
+        yield source
+
+
+async def serve(session: Session, source: DashSource, options: WebOptions, *, view: str = "", open: bool) -> None:
+    """Serve pages until the command is ended; `view` is the part of the address that says what is shown first."""
+    async with WebServer(options, {PATH: endpoint(source)}, page()) as server:
+        url = server.link(view)
+        notify(f"open {url} in a browser; Ctrl-C ends")
+        if open and not await asyncio.to_thread(webbrowser.open, url):
+            notify("no browser was found here: open the address yourself")
+        try:
             await asyncio.get_running_loop().create_future()
+        finally:
+            if session.verbose:
+                _report_refused(server.refused | source.refused)
+
+
+def _report_refused(refused: dict[str, int]) -> None:
+    for reason, count in sorted(refused.items()):
+        notify(f"{count} refused: {reason}")
 
 
 command = joined(dash, endless=lambda _: True)

@@ -6,14 +6,14 @@ A command may get lost, so it is repeated until the module's ALIVE confirms it. 
 import asyncio
 import difflib
 from collections.abc import AsyncIterator
-from itertools import pairwise
 from typing import Annotated, Any
 
 import typer
 
 import r2p
-from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, WIRE_VERSION
+from r2p.codecs.management import WIRE_VERSION
 from r2p.messages.values import to_plain
+from r2p.monitoring.commands import TIMEOUT, CommandProgress
 from r2p.names import module_alias, module_path
 from r2p.tools import session
 from r2p.tools.completion import complete_module
@@ -21,13 +21,9 @@ from r2p.tools.options import All, Format, Timeout, Wait
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, TimedOut, UsageError, alias_or_none, wait_until
 
-TIMEOUT = 10.0
-"""Seconds in which a command must be confirmed: firmware with many topics sends ALIVE that rarely."""
-
 _FIRST_STATE = 1.0  # seconds to learn the module's state before the first command
 _ROUND = 5.0  # seconds in which firmware sends ALIVE at least once
 _REPEAT = 1.0  # seconds between two commands
-_PROMPT = 0.2  # seconds: firmware sends ALIVE 10 ms after a command to restart
 
 app = session.group("List, stop and restart modules.")
 
@@ -156,22 +152,24 @@ class _CommandSender:
         view = _find(session, name)
         if view is not None and view.kind == "ROS":
             raise r2p.Error(f"{view.name} is a ROS node, which knows no {command.name}: use the commands of ROS")
-        self.name = name if view is None else view.name
-        """The name of the module; what the user has given, which may be its alias, until the module is known."""
         self._session = session
         self._command = command
-        self._flags = [] if view is None else [_flags(view)]  # in order
+        self._progress = CommandProgress(command, view, name)
         self._sent_at = 0.0
-        self._denied = ""  # why a gateway does not forward the command
         self._settled = asyncio.create_task(session.settled())
         self._firmware_heard_at = asyncio.get_running_loop().time() + _ROUND  # by then each has sent ALIVE
+
+    @property
+    def name(self) -> str:
+        """The name of the module; what the user has given, which may be its alias, until the module is known."""
+        return self._progress.name
 
     def close(self) -> None:
         self._settled.cancel()
 
     def awaited(self) -> str:
         """Say what the command waits for."""
-        if self._flags:
+        if self._progress.flags:
             return f"{self.name} to confirm {self._command.name}"
         if not self._may_be_firmware():
             return f"{self.name} to announce itself"
@@ -180,31 +178,26 @@ class _CommandSender:
     async def watch(self, events: AsyncIterator[r2p.ModuleEvent]) -> None:
         """Note each change of the module's flags, and whether a gateway denies the command."""
         async for event in events:
-            match event:
-                case r2p.ModuleChanged(info=info) if self.name in (info.name, module_alias(info.name)):
-                    self.name = info.name
-                    self._flags.append(info.flags)
-                case r2p.LinkNotice(kind=kind, text=text) if kind == f"{self._command.name} denied":
-                    self._denied = text
+            self._progress.note(event)
 
     async def repeat_until_confirmed(self) -> None:
         """Send the command until the module confirms it.
 
         Raises r2p.Error if there is no such module or it can't obey, and if a gateway denies the command.
         """
-        await wait_until(lambda: bool(self._flags) or self._is_unknown(), _FIRST_STATE)
+        await wait_until(lambda: bool(self._progress.flags) or self._is_unknown(), _FIRST_STATE)
         while True:
             if self._is_unknown():
                 raise r2p.Error(unknown_module(self._session, self.name))
             await self._check_has_loader()
-            if not self._flags:
+            if not self._progress.flags:
                 self._session.module.query()  # again: a gateway may not have heard the first one
             self._session.module.command(self._command, self.name)
             self._sent_at = asyncio.get_running_loop().time()
             if await wait_until(self._is_over, _REPEAT) and not self._is_unknown():
                 break
-        if self._denied:
-            raise r2p.Error(self._denied)
+        if self._progress.denied:
+            raise r2p.Error(self._progress.denied)
 
     async def _check_has_loader(self) -> None:
         """Raise r2p.Error if the command needs a boot loader, and the module has none: it says so after its name."""
@@ -221,11 +214,11 @@ class _CommandSender:
             raise r2p.Error(f"{self.name} is an r2p module, a program without a boot loader: it would refuse BOOTLOAD")
 
     def _is_over(self) -> bool:
-        return bool(self._denied) or self._confirmed() or self._is_unknown()
+        return bool(self._progress.denied) or self._confirmed() or self._is_unknown()
 
     def _is_unknown(self) -> bool:
         """Return whether the module would have been heard by now."""
-        if self._flags or not self._settled.done():
+        if self._progress.flags or not self._settled.done():
             return False
         return not self._may_be_firmware() or asyncio.get_running_loop().time() >= self._firmware_heard_at
 
@@ -234,35 +227,8 @@ class _CommandSender:
         return on_bus or self._session.may_have_firmware()
 
     def _confirmed(self) -> bool:
-        if not self._flags:
-            return False
-        match self._command:
-            case r2p.Command.STOP:
-                return bool(self._flags[-1] & FLAG_STOPPED)
-            case r2p.Command.BOOTLOAD:
-                return bool(self._flags[-1] & FLAG_BOOT)
-            case _:
-                return self._has_rebooted()
-
-    def _has_rebooted(self) -> bool:
-        """Return whether the flags show a restart; firmware that was rebooted before shows it by a prompt ALIVE."""
-        if not _restarted(self._flags[-1]):
-            return False
-        if any(_restarted(after) and not _restarted(before) for before, after in pairwise(self._flags)):
-            return True
-        view = _find(self._session, self.name)
-        if view is None or view.instance is not None:
-            return False
-        return 0 <= asyncio.get_running_loop().time() - view.age - self._sent_at < _PROMPT
-
-
-def _restarted(flags: int) -> bool:
-    return flags & (FLAG_REBOOTED | FLAG_STOPPED | FLAG_BOOT) == FLAG_REBOOTED
-
-
-def _flags(view: r2p.ModuleView) -> int:
-    state = {"stopped": FLAG_STOPPED, "boot": FLAG_BOOT}.get(view.state, 0)
-    return state | (FLAG_REBOOTED if view.rebooted else 0)
+        since = asyncio.get_running_loop().time() - self._sent_at
+        return self._progress.is_confirmed(_find(self._session, self.name), since)
 
 
 def _find(session: Session, name: str) -> r2p.ModuleView | None:

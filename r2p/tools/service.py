@@ -12,10 +12,9 @@ import typer
 
 import r2p
 from r2p.codecs.services import REQUESTS, RESPONSES, is_of_service
-from r2p.messages import Nested
 from r2p.messages.values import parse, to_plain
 from r2p.names import topic_name
-from r2p.services.definition import Definition, define
+from r2p.services.definition import Definition, body_of, define
 from r2p.tools import session
 from r2p.tools.completion import complete_module, complete_service, complete_type
 from r2p.tools.options import Format, Wait, time_option
@@ -198,15 +197,6 @@ def _body(types: Types, pair: _Pair, field: str) -> type[r2p.Message] | None:
         return cls
     topic_type = types.of(pair.requests if field == _REQUEST else pair.responses)
     return None if topic_type is None else body_of(topic_type, field)
-
-
-def body_of(cls: type[r2p.Message], field: str) -> type[r2p.Message] | None:
-    """Return the type of the field of a topic's messages that holds request or response, if it has one."""
-    for each in r2p.layout(cls).fields:
-        if each.name == field and isinstance(each.shape, Nested):
-            found: type[r2p.Message] = each.shape.layout.cls
-            return found
-    return None
 
 
 def _type_name(types: Types, pair: _Pair) -> str | None:

@@ -13,7 +13,7 @@ import secrets
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from types import TracebackType
 from typing import Self
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, quote, urlsplit
 
 import msgspec
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -100,9 +100,17 @@ class WebServer:
     @property
     def url(self) -> str:
         """The address of the page; with the token behind #, where it stays in the browser."""
+        return self.link()
+
+    def link(self, view: str = "") -> str:
+        """Return the address that opens a view of the page, as "/plots/odometry.x"."""
         host, port = self.address
         shown = f"[{host}]" if ":" in host else host
-        return f"http://{shown}:{port}/" + (f"#token={self.token}" if self.token else "")
+        if self.token is None:
+            fragment = view
+        else:
+            fragment = f"token={self.token}" + (f"&view={quote(view, safe='')}" if view else "")
+        return f"http://{shown}:{port}/" + (f"#{fragment}" if fragment else "")
 
     async def __aenter__(self) -> Self:
         """Begin to listen. Raises WebError if the address can't be used."""

@@ -17,7 +17,8 @@ News:
                 "time": ns, "module": ..., "node": ..., "sequence": n, "skipped": n, "fields": {...}}
     published   of a topic that is published at a rate, once a second, and at its end: {"op": "published", "topic": ...,
                 "sent": n, "running": bool, "error"?: why it has ended}
-    dropped     {"op": "dropped", "streams": {NAME: n}}: what this page was too slow for, in all
+    dropped     {"op": "dropped", "streams": {NAME: n}}: what this page was too slow for, in all: points of "plot
+                STREAM", messages of "message TOPIC", records of "log"
     clock       of a recording: {"op": "clock", "time": ns, "playing": true, "rate": 1.0}
     plotted     of a recording, after points: {"op": "plotted", "stream": n, "share": how much of it is read, 0 to 1,
                 "messages": n, "undecodable": n}
@@ -39,6 +40,9 @@ from typing import Any, Literal
 import msgspec
 
 POINTS = 1
+STREAM_MAX = (1 << 16) - 1
+"""The greatest number of a stream."""
+
 _HEAD = struct.Struct("<BBHI")
 
 
@@ -210,11 +214,14 @@ def decode(data: str | bytes) -> DashRequest:
 
 def points(stream: int, times: Sequence[float], columns: Sequence[Sequence[float]]) -> bytes:
     """Encode points: `times` in s, and the values of each column at these."""
-    count = len(times)
-    return b"".join(
-        (
-            _HEAD.pack(POINTS, len(columns), stream, count),
-            struct.pack(f"<{count}d", *times),
-            *(struct.pack(f"<{count}d", *column) for column in columns),
-        )
-    )
+    return join_points(stream, len(times), pack_values(times), [pack_values(column) for column in columns])
+
+
+def pack_values(values: Sequence[float]) -> bytes:
+    """Pack times, or the values of a column."""
+    return struct.pack(f"<{len(values)}d", *values)
+
+
+def join_points(stream: int, count: int, times: bytes, columns: Sequence[bytes]) -> bytes:
+    """Encode points whose times and columns are packed already, perhaps for several pages."""
+    return b"".join((_HEAD.pack(POINTS, len(columns), stream, count), times, *columns))

@@ -1,12 +1,20 @@
-"""Serves one page: answers its requests, and sends it the figures that have changed."""
+"""Serves one page: answers its requests, and sends it the figures that have changed.
+
+A page that does not read gets fewer states, never wrong ones: the next state is made when the last one is on its way,
+of all that has changed since. One that asks for too much waits, or is refused; nothing that it does keeps other pages
+waiting.
+"""
 
 import asyncio
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from typing import Any
 
 import msgspec
 
 from r2p.errors import Error
+from r2p.log_lines import get_logger
 from r2p.monitoring.snapshot import Figures, NetworkSnapshot
 from r2p.web.client import WebClient
 from r2p.web.dash import protocol
@@ -15,66 +23,172 @@ from r2p.web.server import WebEndpoint
 
 PATH = "/dash"
 
+REQUESTS_MAX = 32
+"""Requests of one page that are worked on at the same time; more are refused."""
+REQUEST_RATE = 200.0
+"""Requests of one page per second, in the long run; beyond that it waits."""
+
 _TABLES = ("modules", "topics", "services", "links", "buses")
+_BURST = 200  # requests of a page that do not wait, as when it opens
+_ROWS = 500  # of one message with figures
+_DROPPED_PERIOD = 1.0  # seconds between two reports of what a page was too slow for
+_ERROR_MAX = 1000  # characters of an error
+
+logger = get_logger("r2p.web")
+
+_Table = dict[str, Figures]
+_Tables = dict[str, _Table]
 
 
 def endpoint(source: DashSource) -> WebEndpoint:
     """Return what serves pages from a source."""
+    states = StateEncoder()
 
     async def handle(client: WebClient) -> None:
         client.send(protocol.encode(source.hello()).decode())
         session = source.session(client)
+        page = _Page(source, session, client)
         try:
             async with asyncio.TaskGroup() as tasks:
-                news = tasks.create_task(_send_states(session, client))
-                async for message in client:
-                    tasks.create_task(_answer(session, client, message))
-                news.cancel()
+                news = [tasks.create_task(_send_states(session, client, states)), tasks.create_task(_report(client))]
+                await page.serve(tasks)
+                for task in news:
+                    task.cancel()
         finally:
             await session.close()
 
     return WebEndpoint(handle)
 
 
-async def _answer(session: SourceSession, client: WebClient, message: str | bytes) -> None:
-    try:
-        request = protocol.decode(message)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        client.send(protocol.encode({"id": None, "error": str(error)}).decode())
-        return
-    answer: dict[str, Any] = {"id": request.id}
-    try:
-        answer["result"] = await session.answer(request)
-    except (Error, TimeoutError) as error:
-        answer["error"] = str(error)
-    client.send(protocol.encode(answer).decode())
+class _Page:
+    """The requests of one page."""
+
+    def __init__(self, source: DashSource, session: SourceSession, client: WebClient) -> None:
+        self._source = source
+        self._session = session
+        self._client = client
+        self._running: set[asyncio.Task[None]] = set()
+
+    async def serve(self, tasks: asyncio.TaskGroup) -> None:
+        """Answer requests until the page leaves; then end those that are worked on."""
+        loop = asyncio.get_running_loop()
+        allowed_at = loop.time() - _BURST / REQUEST_RATE
+        async for message in self._client:
+            allowed_at = max(allowed_at + 1 / REQUEST_RATE, loop.time() - _BURST / REQUEST_RATE)
+            if allowed_at > loop.time():
+                await asyncio.sleep(allowed_at - loop.time())
+            self._begin(tasks, message)
+        for task in self._running:
+            task.cancel()
+
+    def _begin(self, tasks: asyncio.TaskGroup, message: str | bytes) -> None:
+        try:
+            request = protocol.decode(message)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            self._refuse(None, "malformed request", str(error))
+            return
+        if len(self._running) >= REQUESTS_MAX:
+            self._refuse(request.id, "too many requests", f"{REQUESTS_MAX} requests are not answered yet: try again")
+            return
+        task = tasks.create_task(self._answer(request))
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
+
+    async def _answer(self, request: protocol.DashRequest) -> None:
+        try:
+            data = protocol.encode({"id": request.id, "result": await self._session.answer(request)}).decode()
+        except (Error, TimeoutError) as error:
+            self._send_error(request.id, str(error))
+        except Exception:  # noqa: BLE001 - the page goes on, and so do the other ones
+            logger.exception("internal error: the page's request %r", type(request).__name__)
+            self._send_error(request.id, "internal error: see the log of r2p dash")
+        else:
+            self._client.send(data)
+
+    def _refuse(self, number: int | None, reason: str, text: str) -> None:
+        self._source.refused[reason] += 1
+        self._send_error(number, text)
+
+    def _send_error(self, number: int | None, text: str) -> None:
+        self._client.send(protocol.encode({"id": number, "error": text[:_ERROR_MAX]}).decode())
 
 
-async def _send_states(session: SourceSession, client: WebClient) -> None:
-    before: dict[str, dict[str, Figures]] = {table: {} for table in _TABLES}
+async def _report(client: WebClient) -> None:
+    """Report what the page was too slow for, when there is more of it."""
+    reported = 0
     while True:
-        snapshot = await session.snapshots()
-        now = {table: _keyed(getattr(snapshot, table)) for table in _TABLES}
-        client.send(protocol.encode(_difference(snapshot, before, now)).decode(), "state")
-        before = now
+        await asyncio.sleep(_DROPPED_PERIOD)
+        if client.dropped.total() > reported:
+            reported = client.dropped.total()
+            await client.drained()
+            client.send(protocol.encode({"op": "dropped", "streams": dict(client.dropped)}).decode())
 
 
-def _difference(
-    snapshot: NetworkSnapshot, before: dict[str, dict[str, Figures]], now: dict[str, dict[str, Figures]]
-) -> dict[str, Any]:
-    changed = {
-        table: {key: row for key, row in rows.items() if before[table].get(key) != row} for table, rows in now.items()
-    }
+# Figures
+
+
+class StateEncoder:
+    """Makes states for all pages: pages that have seen the same one before get the same message, made once."""
+
+    def __init__(self) -> None:
+        self._snapshot: NetworkSnapshot | None = None
+        self._tables: _Tables = {}
+        self._made: tuple[_Tables, list[str]] | None = None
+
+    def tables(self, snapshot: NetworkSnapshot) -> _Tables:
+        """Return the rows of a snapshot by table and key."""
+        if snapshot is not self._snapshot:
+            self._snapshot, self._made = snapshot, None
+            self._tables = {table: keyed(getattr(snapshot, table)) for table in _TABLES}
+        return self._tables
+
+    def messages(self, before: _Tables, snapshot: NetworkSnapshot) -> list[str]:
+        """Return the messages for a page that has seen `before`."""
+        now = self.tables(snapshot)
+        if self._made is None or self._made[0] is not before:
+            self._made = before, [protocol.encode(each).decode() for each in differences(snapshot, before, now)]
+        return self._made[1]
+
+
+_NOTHING: _Tables = {table: {} for table in _TABLES}
+
+
+async def _send_states(session: SourceSession, client: WebClient, states: StateEncoder) -> None:
+    before = _NOTHING
+    with contextlib.suppress(Error):  # the network was closed
+        while True:
+            snapshot = await session.snapshots()
+            for message in states.messages(before, snapshot):
+                await client.drained()
+                client.send(message)
+            before = states.tables(snapshot)
+
+
+def differences(snapshot: NetworkSnapshot, before: _Tables, now: _Tables) -> Iterator[dict[str, Any]]:
+    """Yield states that lead from one set of figures to another one, of at most 500 rows each; at least one."""
+    head = {"op": "state", "time": snapshot.time, "network": snapshot.network}
     gone = {table: sorted(before[table].keys() - rows.keys()) for table, rows in now.items()}
-    return {
-        "op": "state",
-        "time": snapshot.time,
-        "network": snapshot.network,
-        "changed": {table: rows for table, rows in changed.items() if rows},
-        "gone": {table: keys for table, keys in gone.items() if keys},
-    }
+    news: dict[str, Any] = head | {"changed": {}, "gone": {table: keys for table, keys in gone.items() if keys}}
+    left = _ROWS
+    for table, rows in now.items():
+        changed = _changed(before[table], rows)
+        while part := dict(islice(changed, left)):
+            news["changed"][table] = part
+            left -= len(part)
+            if not left:
+                yield news
+                news, left = head | {"changed": {}, "gone": {}}, _ROWS
+    if left < _ROWS or news["gone"] or before is _NOTHING:
+        yield news
 
 
-def _keyed(rows: Iterable[Any]) -> dict[str, Figures]:
+def _changed(before: _Table, now: _Table) -> Iterator[tuple[str, Figures]]:
+    for key, row in now.items():
+        old = before.get(key)
+        if old is not row and old != row:
+            yield key, row
+
+
+def keyed(rows: Iterable[Any]) -> _Table:
     """Return the rows of a table by their key; of links the module is a part of it."""
     return {f"{row.module} {row.name}" if hasattr(row, "module") else row.name: row for row in rows}

@@ -1,6 +1,7 @@
 """Where a page gets what it shows: a running network, or a recording."""
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from typing import Any
 
 from r2p.errors import WebError
@@ -11,6 +12,10 @@ from r2p.web.dash import protocol
 
 class DashSource(ABC):
     """What all pages of one process share. A `SourceSession` of it serves one page."""
+
+    def __init__(self) -> None:
+        self.refused: Counter[str] = Counter()
+        """Requests of pages that were refused, by reason."""
 
     @abstractmethod
     def hello(self) -> dict[str, Any]:
