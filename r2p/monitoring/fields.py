@@ -226,7 +226,7 @@ def _place(shape: Shape, steps: Steps) -> tuple[int, Scalar]:
 def _generated(shape: Layout[Any], wanted: Sequence[Steps]) -> tuple[Callable[[bytes], Any], Wanted]:
     """Return the generated function that reads all numbers, and the place of each in what it returns."""
     places = {steps: place for place, steps in enumerate(dict.fromkeys(wanted))}
-    source = _Reader(len(places))
+    source = _ExtractorSource(len(places))
     try:
         source.add(Nested(shape), places)
         file = f"{__file__}, {shape.cls.__name__}"
@@ -236,7 +236,7 @@ def _generated(shape: Layout[Any], wanted: Sequence[Steps]) -> tuple[Callable[[b
     return source.names["read"], places
 
 
-class _Reader:
+class _ExtractorSource:
     """The source of a function that reads `count` numbers: runs of fields of fixed size, and what varies in between."""
 
     def __init__(self, count: int) -> None:

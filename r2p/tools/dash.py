@@ -58,12 +58,12 @@ async def dash(
 async def live_source(session: Session, *, allow_publish: bool, allow_control: bool) -> AsyncIterator[LiveSource]:
     """Watch the network of a command."""
     stated = Types(session.settings)
-    finder = TypeFinder(session.module, {topic: cls for topic in session.settings.types if (cls := stated.stated(topic, None))})
+    finder = TypeFinder(
+        session.module, {topic: cls for topic in session.settings.types if (cls := stated.stated(topic, None))}
+    )
     async with (
         NetworkMonitor(session.module) as monitor,
-        LiveSource(
-            session.module, monitor, finder, allow_publish=allow_publish, allow_control=allow_control
-        ) as source,
+        LiveSource(session.module, monitor, finder, allow_publish=allow_publish, allow_control=allow_control) as source,
     ):
         yield source
 

@@ -8,6 +8,7 @@ import threading
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from r2p.monitoring.monitor import NetworkMonitor
+from r2p.monitoring.topic_types import TypeFinder
 from r2p.tools.session import Settings, join
 from r2p.web.dash.assets import page
 from r2p.web.dash.live import LiveSource
@@ -94,8 +95,11 @@ async def serve(
 ) -> AsyncIterator[Dash]:
     """What `r2p dash` does, in this process: what the page shows can be compared with what the monitor knows."""
     async with join(Settings(via=[via])) as session, NetworkMonitor(session.module) as monitor:
-        source = LiveSource(session.module, monitor, allow_publish=publish, allow_control=control)
-        async with WebServer(WebOptions(token=token), {PATH: endpoint(source)}, page()) as server:
+        types = TypeFinder(session.module)
+        async with (
+            LiveSource(session.module, monitor, types, allow_publish=publish, allow_control=control) as source,
+            WebServer(WebOptions(token=token), {PATH: endpoint(source)}, page()) as server,
+        ):
             yield Dash(monitor, server)
 
 

@@ -57,6 +57,7 @@ class LiveSource(DashSource):
 
     async def __aenter__(self) -> Self:
         self._stack = AsyncExitStack()
+        self._stack.callback(self.types.close)
         self._stack.callback(self.feeds.close)
         self._stack.push_async_callback(self.log.close)
         return self

@@ -105,7 +105,11 @@ class Describe(_Request, tag="describe"):
 
 
 class Publish(_Request, tag="publish"):
-    """Publish a message, once, or `rate` times a second until another one comes, it is stopped, or the page leaves."""
+    """Publish a message, once, or `rate` times a second until another one comes, it is stopped, or the page leaves.
+
+    The answer is {"subscribers": n}, to whom the first one went. `type` is for a topic that nobody has yet: the full
+    name of one of r2p's standard types.
+    """
 
     topic: str
     value: dict[str, Any]

@@ -35,17 +35,17 @@ class Publications:
         self._repeating: dict[str, asyncio.Task[None]] = {}
 
     async def publish(self, request: protocol.Publish) -> object:
-        """Publish a message, and begin to repeat it at its rate; return whether it has a subscriber."""
+        """Publish a message, and begin to repeat it at its rate; return how many subscribers it has."""
         if not 0 <= request.rate <= RATE_MAX:
             raise WebError(f"a page publishes at most {RATE_MAX:g} messages per second, not {request.rate:g}")
         publisher, message = await self._prepare(request)
         await self._stop(request.topic)
-        has_subscriber = await self._has_subscriber(request.topic)
+        await self._wait_for_subscriber(publisher)
         await publisher.publish(message)
         if request.rate:
             task = asyncio.create_task(self._repeat(request.topic, publisher, message, request.rate))
             self._repeating[request.topic] = task
-        return {"subscribed": has_subscriber}
+        return {"subscribers": publisher.subscribers}
 
     async def stop(self, request: protocol.StopPublishing) -> None:
         """Publish a topic no more at a rate."""
@@ -70,19 +70,12 @@ class Publications:
             publisher = self._publishers[request.topic] = self._feeds.node.advertise(request.topic, cls)
         return publisher, message
 
-    async def _has_subscriber(self, topic: str) -> bool:
-        """Wait a little for a subscriber: one that is there has to learn of the publisher first."""
+    async def _wait_for_subscriber(self, publisher: Publisher[Any]) -> None:
+        """Wait a little before the first message: subscribers that are there have to learn of the publisher first."""
         loop = asyncio.get_running_loop()
         end = loop.time() + _SUBSCRIBER
-        while not self._is_subscribed(topic):
-            if loop.time() >= end:
-                return False
+        while not (publisher.sent or publisher.subscribers) and loop.time() < end:  # noqa: ASYNC110 - there is no event
             await asyncio.sleep(_LOOK)
-        return True
-
-    def _is_subscribed(self, topic: str) -> bool:
-        view = self._feeds.module.network.topics().get(topic)
-        return view is not None and bool(view.subscribers or view.subscribed_on)
 
     async def _stop(self, topic: str) -> None:
         task = self._repeating.pop(topic, None)

@@ -99,7 +99,7 @@ class _Page:
             data = protocol.encode({"id": request.id, "result": await self._session.answer(request)}).decode()
         except (Error, TimeoutError) as error:
             self._send_error(request.id, str(error))
-        except Exception:  # noqa: BLE001 - the page goes on, and so do the other ones
+        except Exception:
             logger.exception("internal error: the page's request %r", type(request).__name__)
             self._send_error(request.id, "internal error: see the log of r2p dash")
         else:
