@@ -1,17 +1,21 @@
 // The connection to the process that serves this page: r2p/web/dash/protocol.py says what both tell each other.
 
 const POINTS = 1
-const RETRY = 1000 // ms
+const RETRY = 1_000 // ms, and then twice as long each time
+const RETRY_MAX = 8_000 // ms
 const TOKEN = "r2p-token"
 
-// The token of the link stays in this tab, and out of the address bar.
+// The token of the link stays in this tab, and out of the address bar. It may go before the address of a view:
+// #token=TOKEN/plots/odometry.pose.x
 function token() {
-  const given = new URLSearchParams(location.hash.slice(1)).get("token")
-  if (given) {
-    sessionStorage.setItem(TOKEN, given)
-    history.replaceState(null, "", location.pathname)
+  const [, given, view] = location.hash.match(/^#token=([^/&]+)(\/.*)?$/) ?? []
+  try {
+    if (given) sessionStorage.setItem(TOKEN, decodeURIComponent(given))
+    if (given) history.replaceState(null, "", location.pathname + (view ? `#${view}` : ""))
+    return sessionStorage.getItem(TOKEN)
+  } catch {
+    return given ?? null // the browser stores nothing for this page
   }
-  return sessionStorage.getItem(TOKEN)
 }
 
 export class Connection extends EventTarget {
@@ -20,10 +24,17 @@ export class Connection extends EventTarget {
   #streams = new Map()
   #next = 1
   #token = token()
+  #wait = RETRY
+  #timer = 0
+  #ever = false
 
+  // Connect now, unless it is connected. News are events by their `op`; "lost" has {reason, wait (ms), ever}.
   open() {
+    clearTimeout(this.#timer)
+    if (this.#socket && this.#socket.readyState <= WebSocket.OPEN) return
     const query = this.#token ? `?token=${encodeURIComponent(this.#token)}` : ""
-    const socket = new WebSocket(`ws://${location.host}/dash${query}`)
+    const scheme = location.protocol === "https:" ? "wss" : "ws"
+    const socket = new WebSocket(`${scheme}://${location.host}/dash${query}`)
     socket.binaryType = "arraybuffer"
     socket.onmessage = event => this.#receive(event.data)
     socket.onclose = event => this.#lose(event.reason)
@@ -47,6 +58,7 @@ export class Connection extends EventTarget {
   #receive(data) {
     if (typeof data !== "string") return this.#receivePoints(data)
     const message = JSON.parse(data)
+    if (message.op === "hello") this.#settle()
     if (message.op) return this.dispatchEvent(new CustomEvent(message.op, { detail: message }))
     const pending = this.#pending.get(message.id)
     this.#pending.delete(message.id)
@@ -63,10 +75,17 @@ export class Connection extends EventTarget {
     this.#streams.get(view.getUint16(2, true))?.(column(0), columns)
   }
 
+  #settle() {
+    this.#wait = RETRY
+    this.#ever = true
+  }
+
   #lose(reason) {
     for (const { reject } of this.#pending.values()) reject(new Error("the connection was lost"))
     this.#pending.clear()
-    this.dispatchEvent(new CustomEvent("lost", { detail: reason }))
-    setTimeout(() => this.open(), RETRY)
+    this.#streams.clear()
+    this.#timer = setTimeout(() => this.open(), this.#wait)
+    this.dispatchEvent(new CustomEvent("lost", { detail: { reason, wait: this.#wait, ever: this.#ever } }))
+    this.#wait = Math.min(2 * this.#wait, RETRY_MAX)
   }
 }

@@ -1,49 +1,73 @@
-// The page: its views, and which of them is shown. Each view is a module of its own, with `id`, `title` and
-// `create(app)`, which returns {element, show(argument), hide()}. Its address is #/ID or #/ID/ARGUMENT.
+// The page: its views, and which of them is shown. Each view is a module of its own, an object with
+//   id, title       its address is #/ID or #/ID/ARGUMENT
+//   keys            what help says of its keys: [["+ -", "zoom"], ...]; optional
+//   available(hello)   whether this process has it; optional
+//   create(app)     returns {element, show(argument), hide()}, once; and optionally key(event), which returns true
+//                   for a key that it has used
+// A control with `data-filter` takes the keyboard on "/", one with `data-pause` is pressed by "p" and the space bar.
 
 import { Connection } from "./connection.js"
 import { overview } from "./overview.js"
+import { Shell } from "./shell.js"
 import { Store } from "./store.js"
 
-const VIEWS = [overview]
+const VIEWS = [
+  overview,
+]
 
 const connection = new Connection()
-const app = { connection, store: new Store(connection), hello: null, open: (id, argument = "") => {
-  location.hash = `#/${id}/${encodeURIComponent(argument)}`
-} }
+const app = {
+  connection,
+  store: new Store(connection),
+  hello: null, // what the process allows: {recording, publish, control, ...}
+  stats: { frames: 0, points: 0, redraws: 0 }, // what plots have done, in all
+  has: id => VIEWS.some(view => view.id === id),
+  address: (id, argument = "") => argument ? `#/${id}/${escape(argument)}` : `#/${id}`,
+  open(id, argument = "") {
+    location.hash = app.address(id, argument)
+  },
+  // Name the argument of the shown view without showing it anew: what the address bar keeps.
+  rename(id, argument = "") {
+    history.replaceState(null, "", app.address(id, argument))
+  },
+}
+
+// Names stay readable in the address bar: what a hash may have is left as it is.
+function escape(argument) {
+  return encodeURIComponent(argument).replace(/%(2B|2F|2C|3A|3D|3B|40|5B|5D|24|28|29)/g, decodeURIComponent)
+}
+
+function unescape(argument) {
+  try {
+    return decodeURIComponent(argument)
+  } catch {
+    return argument
+  }
+}
+
+const shell = new Shell(app, VIEWS)
 const created = new Map()
 let shown = null
 
 function show() {
-  const [, id, argument] = location.hash.split("/")
+  const [, id = "", argument = ""] = location.hash.match(/^#\/([^/]*)(?:\/(.*))?$/) ?? []
   const view = VIEWS.find(each => each.id === id) ?? VIEWS[0]
   if (!created.has(view.id)) created.set(view.id, view.create(app))
-  shown?.hide()
-  shown = created.get(view.id)
-  document.getElementById("view").replaceChildren(shown.element)
-  for (const link of document.querySelectorAll("#views a"))
-    link.toggleAttribute("aria-current", link.dataset.view === view.id)
-  shown.show(decodeURIComponent(argument ?? ""))
+  const next = created.get(view.id)
+  if (next !== shown) {
+    shown?.hide()
+    document.getElementById("view").replaceChildren(next.element)
+  }
+  shown = next
+  shell.shows(view, next)
+  next.show(unescape(argument))
 }
 
-for (const view of VIEWS) {
-  const link = document.createElement("a")
-  link.href = `#/${view.id}`
-  link.dataset.view = view.id
-  link.textContent = view.title
-  document.getElementById("views").append(link)
-}
-
-const state = document.getElementById("state")
+window.addEventListener("hashchange", show)
 connection.addEventListener("hello", event => {
   app.hello = event.detail
-  state.textContent = "connected"
-  document.title = document.getElementById("title").textContent = event.detail.title || "r2p"
 })
-connection.addEventListener("lost", event => {
-  state.textContent = event.detail || "connection lost: trying again"
-})
-window.addEventListener("hashchange", show)
 window.r2p = app
+shell.start()
 connection.open()
 show()
