@@ -23,6 +23,7 @@ ALL = (
     "rtcan",
     "timers",
     "playing",
+    "browser",
     "start",
     "socketcan",
     "frames",

@@ -13,7 +13,7 @@ import secrets
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from types import TracebackType
 from typing import Self
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, quote, urlsplit
 
 import msgspec
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -106,7 +106,7 @@ class WebServer:
         """Return the address that opens a view of the page, as "/plots/odometry.x"."""
         host, port = self.address
         shown = f"[{host}]" if ":" in host else host
-        fragment = view if self.token is None else f"token={self.token}{view}"
+        fragment = view if self.token is None else f"token={quote(self.token, safe='')}{view}"
         return f"http://{shown}:{port}/" + (f"#{fragment}" if fragment else "")
 
     async def __aenter__(self) -> Self:

@@ -7,11 +7,9 @@ import contextlib
 import threading
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
-from r2p.monitoring.monitor import NetworkMonitor
-from r2p.monitoring.topic_types import TypeFinder
+from r2p.tools.dash import live_source
 from r2p.tools.session import Settings, join
 from r2p.web.dash.assets import page
-from r2p.web.dash.live import LiveSource
 from r2p.web.dash.session import PATH, endpoint
 from r2p.web.server import WebOptions, WebServer
 
@@ -22,6 +20,8 @@ if TYPE_CHECKING:
 
     from playwright.async_api import Browser, ConsoleMessage, Page, Request, WebSocket
 
+    from r2p.monitoring.monitor import NetworkMonitor
+
 T = TypeVar("T")
 
 PATIENCE = 60.0
@@ -30,7 +30,12 @@ SIZES = {"phone": (390, 844), "desktop": (1280, 900)}
 """Of the windows, in CSS pixels."""
 SCHEMES: tuple[Literal["light", "dark"], ...] = ("light", "dark")
 
-_OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
+_OPTIONS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--disable-features=LocalNetworkAccessChecks",  # of new browsers: the server must be safe without them, too
+]
 
 
 class LoopThread:
@@ -94,13 +99,12 @@ async def serve(
     via: str, *, publish: bool = False, control: bool = False, token: str | None = None
 ) -> AsyncIterator[Dash]:
     """What `r2p dash` does, in this process: what the page shows can be compared with what the monitor knows."""
-    async with join(Settings(via=[via])) as session, NetworkMonitor(session.module) as monitor:
-        types = TypeFinder(session.module)
-        async with (
-            LiveSource(session.module, monitor, types, allow_publish=publish, allow_control=control) as source,
-            WebServer(WebOptions(token=token), {PATH: endpoint(source)}, page()) as server,
-        ):
-            yield Dash(monitor, server)
+    async with (
+        join(Settings(via=[via])) as session,
+        live_source(session, allow_publish=publish, allow_control=control) as source,
+        WebServer(WebOptions(token=token), {PATH: endpoint(source)}, page()) as server,
+    ):
+        yield Dash(source.monitor, server)
 
 
 @contextlib.asynccontextmanager
@@ -122,6 +126,8 @@ class Tab:
     def __init__(self, page: Page, url: str) -> None:
         self.page = page
         self.problems: list[str] = []
+        self.expected: tuple[str, ...] = ()
+        """Parts of complaints that a test provokes."""
         self._own = url.partition("#")[0]
         page.on("console", self._console)
         page.on("pageerror", lambda error: self.problems.append(f"error of the page: {error}"))
@@ -141,7 +147,7 @@ class Tab:
             raise AssertionError(f"the page waits for: {condition}") from None
 
     def _console(self, message: ConsoleMessage) -> None:
-        if message.type in ("error", "warning"):
+        if message.type in ("error", "warning") and not any(each in message.text for each in self.expected):
             self.problems.append(f"{message.type} on the console: {message.text}")
 
     def _request(self, request: Request) -> None:
@@ -154,18 +160,18 @@ class Tab:
 
 
 @contextlib.asynccontextmanager
-async def tab(
+async def opened(
     browser: Browser, url: str, size: str = "desktop", scheme: Literal["light", "dark"] = "light"
 ) -> AsyncIterator[Tab]:
-    """A page at this address, once it shows topics; at the end there must have been no problems."""
+    """Open a page at this address; at the end there must have been no problems."""
     width, height = SIZES[size]
     context = await browser.new_context(
         viewport={"width": width, "height": height}, color_scheme=scheme, reduced_motion="reduce"
     )
     try:
-        opened = Tab(await context.new_page(), url)
-        await opened.page.goto(url)
-        yield opened
+        tab = Tab(await context.new_page(), url)
+        await tab.page.goto(url)
+        yield tab
     finally:
         await context.close()
-    assert opened.problems == []
+    assert tab.problems == []
