@@ -7,12 +7,28 @@
 // A control with `data-filter` takes the keyboard on "/", one with `data-pause` is pressed by "p" and the space bar.
 
 import { Connection } from "./connection.js"
+import { graph } from "./graph.js"
+import { log } from "./log.js"
+import { map } from "./map.js"
+import { nodes } from "./nodes.js"
 import { overview } from "./overview.js"
+import { parameters } from "./parameters.js"
+import { publish } from "./publish.js"
+import { services } from "./services.js"
 import { Shell } from "./shell.js"
+import { slots } from "./slots.js"
 import { Store } from "./store.js"
 
 const VIEWS = [
   overview,
+  graph,
+  slots,
+  map,
+  log,
+  nodes,
+  parameters,
+  publish,
+  services,
 ]
 
 const connection = new Connection()

@@ -8,10 +8,13 @@ const STATES = { running: "good", stopped: "warn", boot: "warn", observer: "" }
 
 // Orders to a module: the text of the button, what is asked, and what is said then.
 const MODULE_ORDERS = {
-  start: { text: "Start", danger: false, ask: name => `Start all nodes of ${name}?`, done: name => `${name} is started` },
+  start: {
+    text: "Start", danger: false,
+    ask: name => `Start all nodes of ${name}?`, done: name => `${name} is started`,
+  },
   stop: {
     text: "Stop", danger: true,
-    ask: name => `Stop all nodes of ${name}? What they drive is no longer controlled.`, done: name => `${name} is stopped`,
+    ask: name => `Stop all nodes of ${name}? What they drive is then not controlled.`, done: name => `${name} is stopped`,
   },
   reboot: {
     text: "Reboot", danger: true,
@@ -22,7 +25,7 @@ const NODE_ORDERS = {
   start: { text: "Start", danger: false, ask: name => `Start ${name}?`, done: name => `${name} is started` },
   stop: {
     text: "Stop", danger: true,
-    ask: name => `Stop ${name}? What it drives is no longer controlled.`, done: name => `${name} is stopped`,
+    ask: name => `Stop ${name}? What it drives is then not controlled.`, done: name => `${name} is stopped`,
   },
   restart: {
     text: "Restart", danger: true, ask: name => `Restart ${name}?`, done: name => `${name} is started again`,
@@ -78,7 +81,8 @@ class NodesView {
     for (const module of shown) this.#panel(module).update(module, { control: Boolean(hello?.control) })
     const elements = shown.map(module => this.#panel(module).element)
     const isSame = (element, index) => this.#list.children[index] === element
-    if (elements.length !== this.#list.children.length || !elements.every(isSame)) this.#list.replaceChildren(...elements)
+    const isSameList = elements.length === this.#list.children.length && elements.every(isSame)
+    if (!isSameList) this.#list.replaceChildren(...elements)
     this.#empty.hidden = shown.length > 0
     setText(this.#empty, modules.length ? "Nothing matches the filter" : "No modules yet")
     const all = modules.reduce((sum, module) => sum + (module.nodes?.length ?? 0), 0)
@@ -111,12 +115,16 @@ class ModulePanel {
 
   constructor(app, name) {
     this.#app = app
-    const heads = [["Node"], ["State"], ["Restarts", "number"], ["Publishes", "level-3"], ["Subscribes to", "level-3"], ["Orders", "sr-only"]]
+    const heads = [
+      ["Node"], ["State"], ["Restarts", "number"], ["Publishes", "level-3"], ["Subscribes to", "level-3"], ["Orders"],
+    ]
     this.#table = h("div", { class: "table-box" }, h("table", { class: "plain nodes-table" },
       h("caption", { class: "sr-only" }, `Nodes of ${name}`),
-      h("thead", {}, h("tr", {}, heads.map(([head, kind]) => h("th", { scope: "col", class: kind }, head)))), this.#body))
+      h("thead", {}, h("tr", {}, heads.map(([head, kind]) => h("th", { scope: "col", class: kind }, head)))),
+      this.#body))
     this.element = h("section", { class: "panel module", dataset: { module: name }, "aria-label": `Module ${name}` },
-      h("div", { class: "head" }, h("h2", {}, name), this.#state, this.#facts, h("span", { class: "space" }), this.#orders),
+      h("div", { class: "head" },
+        h("h2", {}, name), this.#state, this.#facts, h("span", { class: "space" }), this.#orders),
       this.#table, this.#none)
   }
 
@@ -146,7 +154,8 @@ class ModulePanel {
     for (const node of list) rows.get(node.name).update(node)
     const elements = [...rows.values()].map(row => row.element)
     const isSame = (element, index) => this.#body.children[index] === element
-    if (elements.length !== this.#body.children.length || !elements.every(isSame)) this.#body.replaceChildren(...elements)
+    const isSameList = elements.length === this.#body.children.length && elements.every(isSame)
+    if (!isSameList) this.#body.replaceChildren(...elements)
     this.#rows = rows
   }
 

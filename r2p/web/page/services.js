@@ -22,7 +22,8 @@ const figure = (id, title, hint, level) => ({
 })
 
 const COLUMNS = app => [
-  { id: "name", title: "Service", value: service => service.name, link: service => app.address("services", service.name) },
+  { id: "name", title: "Service", value: service => service.name,
+    link: service => app.address("services", service.name) },
   { id: "type", title: "Type", level: 3, value: service => service.type, tone: () => "dim" },
   { id: "servers", title: "Servers", value: service => service.servers?.join(", ") || null, level: 2,
     tone: service => service.servers?.length ? "" : "warn", text: service => service.servers?.join(", ") || "none" },
@@ -56,7 +57,8 @@ class ServicesView {
     this.#app = app
     this.#table = new LiveTable({
       id: "services", caption: "Services", columns: COLUMNS(app), key: service => service.name, sort: "name",
-      search: service => [service.name, service.type, ...(service.servers ?? [])].join(" "), empty: "No services are known",
+      search: service => [service.name, service.type, ...(service.servers ?? [])].join(" "),
+      empty: "No services are known",
     })
     const form = h("form", { novalidate: true, autocomplete: "off", onsubmit: event => {
       event.preventDefault()
