@@ -3,7 +3,8 @@
 `format` says what is in a file: start there. `samples` turns samples into records and back, with the classes of `types`
 and the messages of `messages`; `writer` puts records into chunks, and `mcap_writer` writes the file. `bag` reads it: of
 each `bag_file` what its `summary` says is in its `channels` and chunks, by `mcap_reader`, which trusts no number in a
-file. `editing` makes new bags of old ones, and `recovery` a whole one of one that was cut off.
+file. `message_index` finds a few messages of a chunk without the others. `editing` makes new bags of old ones, and
+`recovery` a whole one of one that was cut off.
 
 A `recorder` subscribes to topics (`topics`), and hands what they receive, as `entries`, to the thread of
 `background_writer`; `recording_files` decides where a file ends, and what a full disk costs. Its other parts are

@@ -19,6 +19,7 @@ import msgspec
 
 from r2p.errors import DecodeError
 from r2p.recording.bag import Bag
+from r2p.recording.format import ChannelInfo
 from r2p.recording.messages import (
     EVENTS,
     LOGS,
@@ -58,7 +59,8 @@ KINDS: Final = {
 
 _KIND_OF_EVENT = {"no answer": "module", "answers": "module", "no master": "master", "events lost": "recorder"}
 _BASELINE = 11 * SECOND  # tables of slots are repeated every ten seconds
-_ANSWER_WITHIN = 15 * SECOND  # on slow links, modules are asked each ten seconds
+ANSWER_WITHIN = 15 * SECOND
+"""In this time (ns) a module says again what it counts: on slow links it is asked each ten seconds."""
 _TOGETHER = SECOND  # ns in which the same events are joined
 _LOGGED_MISS = re.compile(r"topic (\S+)(?: \(.*?\))?: (.+) \(missed (\d+), late \d+ so far\)")
 
@@ -121,11 +123,15 @@ def slots_at(bag: Bag, time: int) -> list[SlotTable]:
 
 def _events(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     for each in bag.messages(EVENTS, RecordedEvent, start=start, end=end):
-        event = each.message
-        word = event.kind.partition(" ")[0]
-        kind = _KIND_OF_EVENT.get(event.kind, word if word in KINDS else "notice")
-        subject = event.module or event.topic if kind in ("module", "notice") else event.link
-        yield TimelineEvent(time=each.log_time, kind=kind, about=subject or event.link, text=_event_text(event))
+        yield event_of(each.log_time, each.message)
+
+
+def event_of(time: int, event: RecordedEvent) -> TimelineEvent:
+    """Return what a recorded event says; `time` is its log time."""
+    word = event.kind.partition(" ")[0]
+    kind = _KIND_OF_EVENT.get(event.kind, word if word in KINDS else "notice")
+    subject = event.module or event.topic if kind in ("module", "notice") else event.link
+    return TimelineEvent(time=time, kind=kind, about=subject or event.link, text=_event_text(event))
 
 
 def _event_text(event: RecordedEvent) -> str:
@@ -148,8 +154,12 @@ def _event_text(event: RecordedEvent) -> str:
 # Misses, with the reasons that logs have
 
 
+MissReasons = dict[tuple[str, str], tuple[int, str]]
+"""By module and topic: when it has logged a miss, and why."""
+
+
 def _misses(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
-    reasons: dict[tuple[str, str], tuple[int, str]] = {}  # by module and topic: when it was logged, and what
+    reasons: MissReasons = {}
     answers: dict[str, list[int]] | None = None
     signalled = set[str]()  # modules whose signals are there one by one
     logged = ((each.time, each) for each in _log(bag, start, end))
@@ -159,21 +169,33 @@ def _misses(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
         if isinstance(each, RecordedSignal):
             if each.source == "publisher":
                 signalled.add(each.module)
-            yield _signal(time, each, reasons)
+            yield signal_event(time, each, reasons)
             continue
-        found, module = _LOGGED_MISS.search(each.text), each.about.rpartition("/")[0]
-        if found is not None:
-            reasons[module, found[1]] = time, _DELAY.sub("", found[2])
+        miss = logged_miss(each, reasons)
+        if miss is not None:
+            module = module_of(each)
             answers = _answers(bag, start, end) if answers is None else answers
             if module in signalled or _is_counted(time, answers.get(module, [])):
                 continue
-            each = _logged_miss(each, found)
+            each = miss
         yield each
 
 
-def _logged_miss(logged: TimelineEvent, found: re.Match[str]) -> TimelineEvent:
-    """Return a miss that a module has logged, and then not counted: it was gone before it was asked again."""
+def module_of(logged: TimelineEvent) -> str:
+    """Return the module of an event of the log."""
+    return logged.about.rpartition("/")[0]
+
+
+def logged_miss(logged: TimelineEvent, reasons: MissReasons) -> TimelineEvent | None:
+    """Return the miss that a module has logged, and note its reason; None if the record is about something else.
+
+    Most of these are also in what the module counts: those are left that it logged before it was gone.
+    """
+    found = _LOGGED_MISS.search(logged.text)
+    if found is None:
+        return None
     topic, reason, missed = found[1], _DELAY.sub("", found[2]), int(found[3])
+    reasons[module_of(logged), topic] = logged.time, reason
     about, text = f"{topic} of {logged.about}", f"{reason}, as it logged"
     return TimelineEvent(time=logged.time, kind="missed" if missed else "late", about=about, text=text)
 
@@ -181,7 +203,7 @@ def _logged_miss(logged: TimelineEvent, found: re.Match[str]) -> TimelineEvent:
 def _answers(bag: Bag, start: int, end: int | None) -> dict[str, list[int]]:
     """Return when each module has said what it has counted (UTC, ns)."""
     prefix = f"{STATISTICS}/"
-    until = None if end is None else end + _ANSWER_WITHIN
+    until = None if end is None else end + ANSWER_WITHIN
     times: dict[str, list[int]] = defaultdict(list)
     for each in bag.raw(lambda channel: channel.name.startswith(prefix), start=start, end=until):
         times[each.channel.name.removeprefix(prefix)].append(each.log_time)
@@ -191,16 +213,17 @@ def _answers(bag: Bag, start: int, end: int | None) -> dict[str, list[int]]:
 def _is_counted(time: int, answers: list[int]) -> bool:
     """Return whether a logged miss is also in what its module has counted: some are not, of modules that are gone."""
     following = bisect_left(answers, time)
-    return following < len(answers) and answers[following] - time <= _ANSWER_WITHIN
+    return following < len(answers) and answers[following] - time <= ANSWER_WITHIN
 
 
-def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tuple[int, str]]) -> TimelineEvent:
+def signal_event(time: int, signal: RecordedSignal, reasons: MissReasons) -> TimelineEvent:
+    """Return what a signal says, with the reason that its module has logged."""
     owner = f"{signal.module}/{signal.node}" if signal.node else signal.module
     about = f"{signal.topic} of {owner}" if signal.topic else f"link {signal.where} of {owner}"
     text = signal.reason
     if signal.source == "statistics" and not text:
         logged_at, reason = reasons.get((signal.module, signal.topic), (0, ""))
-        text = f"{reason}, as it logged" if reason and time - logged_at <= _ANSWER_WITHIN else "as it counted"
+        text = f"{reason}, as it logged" if reason and time - logged_at <= ANSWER_WITHIN else "as it counted"
     elif signal.where and signal.topic:
         text = f"{text} ({signal.where})"
     return TimelineEvent(
@@ -216,50 +239,75 @@ def _signal(time: int, signal: RecordedSignal, reasons: dict[tuple[str, str], tu
 
 def _log(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     for each in bag.messages(LOGS, LogRecord, start=start, end=end):
-        record = each.message
-        if record.level >= logging.WARNING:
-            text = f"{logging.getLevelName(record.level)}: {record.msg}"
-            yield TimelineEvent(time=each.log_time, kind="log", about=record.name, text=text)
+        if (event := log_event(each.log_time, each.message)) is not None:
+            yield event
+
+
+def log_event(time: int, record: LogRecord) -> TimelineEvent | None:
+    """Return the event of a log record; None below WARNING."""
+    if record.level < logging.WARNING:
+        return None
+    text = f"{logging.getLevelName(record.level)}: {record.msg}"
+    return TimelineEvent(time=time, kind="log", about=record.name, text=text)
 
 
 def _overdue(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
     """Yield the messages that came after their deadline; by the clock of the recorder, where that is known."""
     for each in bag.raw(lambda channel: channel.kind == "meta", start=start, end=end):
-        info = each.channel.info
-        try:
-            meta = cdr(SampleMeta).decode(each.data)
-        except DecodeError:
-            continue
-        due = meta.expires or meta.deadline
-        if info is not None and 0 < due < each.log_time:
-            owner = "/".join(filter(None, (info.module, info.node)))
-            yield TimelineEvent(
-                time=each.log_time,
-                kind="overdue",
-                about=f"{info.topic} of {owner}" if owner else info.topic,
-                text="received after its deadline",
-                late=(each.log_time - due) / SECOND,
-                sequence=meta.number or (each.sequence if info.numbered else 0),
-            )
+        if (event := overdue_event(each.channel.info, each.log_time, each.sequence, each.data)) is not None:
+            yield event
+
+
+def overdue_event(info: ChannelInfo | None, time: int, sequence: int, data: bytes) -> TimelineEvent | None:
+    """Return the event of a message whose companion says that it came after its deadline; None if it did not."""
+    try:
+        meta = cdr(SampleMeta).decode(data)
+    except DecodeError:
+        return None
+    due = meta.expires or meta.deadline
+    if info is None or not 0 < due < time:
+        return None
+    owner = "/".join(filter(None, (info.module, info.node)))
+    return TimelineEvent(
+        time=time,
+        kind="overdue",
+        about=f"{info.topic} of {owner}" if owner else info.topic,
+        text="received after its deadline",
+        late=(time - due) / SECOND,
+        sequence=meta.number or (sequence if info.numbered else 0),
+    )
 
 
 # Changes
 
 
+SlotOwners = dict[str, dict[tuple[str, str], SlotOwner]]
+"""The owners of slots by bus, then by topic and module."""
+
+ParameterValues = dict[tuple[str, str, str], ParameterValue]
+"""Parameters by module, node and name."""
+
+
 def _slots(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
-    before: dict[str, dict[tuple[str, str], SlotOwner]] = {}
+    before: SlotOwners = {}
     for each in bag.messages(SLOTS, SlotTable, start=start - _BASELINE, end=end):
-        table = each.message
-        owners = {(owner.topic, owner.module): owner for owner in table.owners if owner.topic != "sync"}
-        known = before.get(table.bus)
-        before[table.bus] = owners
-        if known is None or each.log_time < start:
-            continue
-        for key in sorted(known.keys() | owners.keys()):
-            text = _slots_text(known.get(key), owners.get(key))
-            if text:
-                about = f"{key[0]} of {key[1]}" if key[0] else "unused slots"
-                yield TimelineEvent(time=each.log_time, kind="slots", about=about, text=f"{text} on {table.bus}")
+        changes = slot_changes(before, each.log_time, each.message)
+        if each.log_time >= start:
+            yield from changes
+
+
+def slot_changes(before: SlotOwners, time: int, table: SlotTable) -> list[TimelineEvent]:
+    """Return the changes of owners by a table, and enter it; the first one of a bus has none."""
+    owners = {(owner.topic, owner.module): owner for owner in table.owners if owner.topic != "sync"}
+    known = before.get(table.bus)
+    before[table.bus] = owners
+    found = []
+    for key in sorted(known.keys() | owners.keys()) if known is not None else ():
+        text = _slots_text(known.get(key) if known else None, owners.get(key))
+        if text:
+            about = f"{key[0]} of {key[1]}" if key[0] else "unused slots"
+            found.append(TimelineEvent(time=time, kind="slots", about=about, text=f"{text} on {table.bus}"))
+    return found
 
 
 def _slots_text(before: SlotOwner | None, after: SlotOwner | None) -> str:
@@ -275,29 +323,50 @@ def _numbers(owner: SlotOwner) -> str:
 
 
 def _parameters(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
-    values: dict[tuple[str, str, str], ParameterValue] = {}
+    values: ParameterValues = {}
     for each in bag.messages(PARAMETERS, ParameterValue, end=end):
-        new = each.message
-        key = new.module, new.node, new.name
-        before, values[key] = values.get(key), new
-        if before is None or each.log_time < start or (before.value, before.gone) == (new.value, new.gone):
-            continue
-        text = "gone" if new.gone else f"{f'{new.value} {new.unit}'.rstrip()}, was {before.value} ({new.origin})"
-        about = f"{new.module}/{new.node}.{new.name}"
-        yield TimelineEvent(time=each.log_time, kind="parameter", about=about, text=text)
+        change = parameter_change(values, each.log_time, each.message)
+        if change is not None and each.log_time >= start:
+            yield change
+
+
+def parameter_change(values: ParameterValues, time: int, new: ParameterValue) -> TimelineEvent | None:
+    """Return the change of a parameter, and enter its value; the first one is no change."""
+    key = new.module, new.node, new.name
+    before, values[key] = values.get(key), new
+    if before is None or (before.value, before.gone) == (new.value, new.gone):
+        return None
+    text = "gone" if new.gone else f"{f'{new.value} {new.unit}'.rstrip()}, was {before.value} ({new.origin})"
+    about = f"{new.module}/{new.node}.{new.name}"
+    return TimelineEvent(time=time, kind="parameter", about=about, text=text)
 
 
 def _recorder(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
-    """Yield what the recorder lost; its messages have totals."""
-    before: dict[str, tuple[int, int]] = {}
+    """Yield what the recorder lost."""
+    before: LossTotals = {}
     for each in bag.messages(LOSSES, RecorderLosses, end=end):
-        for topic in each.message.topics:
-            dropped, missed = before.get(topic.topic, (0, 0))
-            before[topic.topic] = topic.dropped, topic.missed
-            grown = {
-                "dropped, as the disk was too slow or full": topic.dropped - dropped,
-                "lost on their way to the recorder": topic.missed - missed,
-            }
-            for text, count in grown.items():
-                if count > 0 and each.log_time >= start:
-                    yield TimelineEvent(time=each.log_time, kind="recorder", about=topic.topic, text=text, count=count)
+        grown = recorder_losses(before, each.log_time, each.message)
+        if each.log_time >= start:
+            yield from grown
+
+
+LossTotals = dict[str, tuple[int, int]]
+"""By topic: messages that the recorder has dropped, and missed."""
+
+
+def recorder_losses(before: LossTotals, time: int, losses: RecorderLosses) -> list[TimelineEvent]:
+    """Return what the recorder has lost since the totals of before, and enter the new ones."""
+    found = []
+    for topic in losses.topics:
+        dropped, missed = before.get(topic.topic, (0, 0))
+        before[topic.topic] = topic.dropped, topic.missed
+        grown = {
+            "dropped, as the disk was too slow or full": topic.dropped - dropped,
+            "lost on their way to the recorder": topic.missed - missed,
+        }
+        found += [
+            TimelineEvent(time=time, kind="recorder", about=topic.topic, text=text, count=count)
+            for text, count in grown.items()
+            if count > 0
+        ]
+    return found

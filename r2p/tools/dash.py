@@ -2,10 +2,10 @@
 
 import asyncio
 import webbrowser
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,6 +21,8 @@ from r2p.web.dash.source import DashSource
 from r2p.web.server import LOOPBACK, WebOptions, WebServer
 
 PORT = 8080
+
+_OPENING = 0.3  # s in which files open that end as they should; others are read through while pages can connect
 
 Host = Annotated[
     str, typer.Option(help="The address to listen on; all but loopback need the token of the printed link.")
@@ -44,14 +46,38 @@ async def dash(
         bool, typer.Option("--allow-control", help="Let pages set parameters, and stop and start nodes and modules.")
     ] = False,
 ) -> None:
-    """Show the network in a browser, on a page that this command serves.
+    """Show the network, or a recording, in a browser, on a page that this command serves.
 
     The address is printed. Pages only look, unless an option allows more. Ctrl-C ends it.
     """
     if files:
-        raise UsageError("this version of r2p dash shows no recordings: leave out FILE")
+        await _show_recording(session, files, WebOptions(host=host, port=port), open=open)
+        return
     async with live_source(session, allow_publish=allow_publish, allow_control=allow_control) as source:
         await serve(session, source, WebOptions(host=host, port=port), open=open)
+
+
+def _check(_settings: object, given: Mapping[str, Any]) -> None:
+    """Refuse options that make no sense for a recording. Raises UsageError."""
+    if given["files"] and (given["allow_publish"] or given["allow_control"]):
+        raise UsageError("a recording can only be looked at: leave out --allow-publish and --allow-control")
+
+
+async def _show_recording(session: Session, files: list[Path], options: WebOptions, *, open: bool) -> None:
+    """Serve pages with a recording. Raises BagError if it can't be read."""
+    from r2p.recording.bag_file import bag_paths  # only here: a running network needs no MCAP
+    from r2p.web.dash.recorded.source import RecordedSource
+
+    async with RecordedSource(bag_paths(files)) as source:
+        opening = asyncio.create_task(source.opened())
+        await asyncio.wait([opening], timeout=_OPENING)
+        serving = asyncio.create_task(serve(session, source, options, open=open))
+        try:
+            await opening
+            await serving
+        finally:
+            serving.cancel()
+            await asyncio.wait([serving])
 
 
 @asynccontextmanager
@@ -87,4 +113,4 @@ def _report_refused(refused: dict[str, int]) -> None:
         notify(f"{count} refused: {reason}")
 
 
-command = joined(dash, endless=lambda _: True)
+command = joined(dash, endless=lambda _: True, check=_check, joins=lambda given: not given["files"])

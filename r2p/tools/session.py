@@ -349,7 +349,7 @@ async def join(
 
     `alone`: open no link, whatever the settings have.
     """
-    if not settings.via:
+    if not (settings.via or alone):
         notify("no network: this tool sees only itself; give --via tcp:HOST:PORT or set R2P_VIA")
     alphabet = string.ascii_lowercase + string.digits
     check_urls(settings.via, settings.via_source)

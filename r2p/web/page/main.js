@@ -82,7 +82,15 @@ function show() {
 window.addEventListener("hashchange", show)
 connection.addEventListener("hello", event => {
   app.hello = event.detail
+  if (app.hello.recording) mountTimeline()
 })
+
+// A running network has no time line, so its pages do not load it.
+async function mountTimeline() {
+  const { timelineOf } = await import("./timeline.js")
+  app.timeline ??= timelineOf(app)
+}
+
 window.r2p = app
 shell.start()
 connection.open()

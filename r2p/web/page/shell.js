@@ -167,7 +167,7 @@ export class Shell {
   }
 
   #control(selector) {
-    return by("view").querySelector(selector) ?? by("timeline").querySelector(selector)
+    return by("timeline").querySelector(selector) ?? by("view").querySelector(selector)
   }
 
   #jump(index) {
