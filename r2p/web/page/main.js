@@ -12,6 +12,7 @@ import { log } from "./log.js"
 import { map } from "./map.js"
 import { nodes } from "./nodes.js"
 import { overview } from "./overview.js"
+import { plots } from "./plots.js"
 import { parameters } from "./parameters.js"
 import { publish } from "./publish.js"
 import { services } from "./services.js"
@@ -21,6 +22,7 @@ import { Store } from "./store.js"
 
 const VIEWS = [
   overview,
+  plots,
   graph,
   slots,
   map,
@@ -35,6 +37,7 @@ const connection = new Connection()
 const app = {
   connection,
   store: new Store(connection),
+  plotted: "", // the argument of the plots that are shown
   hello: null, // what the process allows: {recording, publish, control, ...}
   stats: { frames: 0, points: 0, redraws: 0 }, // what plots have done, in all
   has: id => VIEWS.some(view => view.id === id),
