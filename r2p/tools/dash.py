@@ -81,12 +81,13 @@ async def _show_recording(session: Session, files: list[Path], options: WebOptio
 
 
 @asynccontextmanager
-async def live_source(session: Session, *, allow_publish: bool, allow_control: bool) -> AsyncIterator[LiveSource]:
+async def live_source(
+    session: Session, *, allow_publish: bool = False, allow_control: bool = False
+) -> AsyncIterator[LiveSource]:
     """Watch the network of a command."""
-    stated = Types(session.settings)
-    finder = TypeFinder(
-        session.module, {topic: cls for topic in session.settings.types if (cls := stated.stated(topic, None))}
-    )
+    types = Types(session.settings)
+    stated = {topic: types.stated(topic, None) for topic in session.settings.types}
+    finder = TypeFinder(session.module, {topic: cls for topic, cls in stated.items() if cls is not None})
     async with (
         NetworkMonitor(session.module) as monitor,
         LiveSource(session.module, monitor, finder, allow_publish=allow_publish, allow_control=allow_control) as source,
@@ -100,7 +101,7 @@ async def serve(session: Session, source: DashSource, options: WebOptions, *, vi
         url = server.link(view)
         notify(f"open {url} in a browser; Ctrl-C ends")
         if open and not await asyncio.to_thread(webbrowser.open, url):
-            notify("no browser was found here: open the address yourself")
+            notify("no browser was found on this computer: open the address elsewhere, or by hand")
         try:
             await asyncio.get_running_loop().create_future()
         finally:
@@ -113,4 +114,5 @@ def _report_refused(refused: dict[str, int]) -> None:
         notify(f"{count} refused: {reason}")
 
 
-command = joined(dash, endless=lambda _: True, check=_check, joins=lambda given: not given["files"])
+# A robot that is switched off is shown as soon as it is there: the page is served meanwhile.
+command = joined(dash, endless=lambda _: True, keep_trying=True, check=_check, joins=lambda given: not given["files"])
