@@ -14,6 +14,7 @@ QUEUE_BYTES = 4 << 20
 ANSWERS_BYTES = 16 << 20
 """Bytes of other messages that wait for a client; with more it is disconnected, as it does not read its answers."""
 
+_ROOM = 1 << 16  # bytes that wait for a client beyond which it has no room for more
 _MESSAGE_BYTES = 128  # of memory that a waiting message takes besides its data
 
 
@@ -31,8 +32,8 @@ class WebClient:
         self._waiting: Counter[str] = Counter()
         """Messages in the queue, by stream."""
         self._wake = asyncio.Event()
-        self._drained = asyncio.Event()
-        self._drained.set()
+        self._has_room = asyncio.Event()
+        self._has_room.set()
         self._closing: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -63,7 +64,8 @@ class WebClient:
         size = len(message) + _MESSAGE_BYTES
         self._queue.append((message, stream, amount))
         self._wake.set()
-        self._drained.clear()
+        if self._bytes + self._answers + size > _ROOM:
+            self._has_room.clear()
         if stream is None:
             self._answers += size
             if self._answers > ANSWERS_BYTES:
@@ -83,9 +85,9 @@ class WebClient:
             return False
         return self.send(message, stream)
 
-    async def drained(self) -> None:
-        """Wait until everything is written, or the client has left."""
-        await self._drained.wait()
+    async def room(self) -> None:
+        """Wait until little waits for the client, or it has left."""
+        await self._has_room.wait()
 
     def close(self, code: int = 1000, reason: str = "") -> None:
         """Disconnect the client, with a reason of at most 123 bytes."""
@@ -130,9 +132,10 @@ class WebClient:
                     message, stream, _ = self._queue.popleft()
                     self._forget(message, stream)
                     await self._connection.send(message)
-                self._drained.set()
+                    if self._bytes + self._answers <= _ROOM:
+                        self._has_room.set()
                 await self._wake.wait()
         except ConnectionClosed:
             return
         finally:
-            self._drained.set()
+            self._has_room.set()

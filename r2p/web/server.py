@@ -3,16 +3,23 @@
 Safe by default: it listens on loopback, and elsewhere only with a token that each WebSocket has to name. A browser may
 connect only from a page of this server, or of an origin that is allowed: no other page that the user has open can read
 the robot's network. Files are no secret, so they need no token.
+
+What strangers cost is bounded. At most 128 connections are open, and 32 of them are clients. When one more comes, the
+oldest that has not become a client yet is closed: so thousands of sockets that send nothing keep no browser out. A
+request has 16 KiB and ten seconds; a client's messages wait in the socket when four of them are unread.
 """
 
+import asyncio
+import functools
 import hmac
 import http
 import ipaddress
 import logging
 import secrets
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from types import TracebackType
-from typing import Self
+from typing import Any, Self, cast
 from urllib.parse import parse_qs, quote, urlsplit
 
 import msgspec
@@ -29,10 +36,18 @@ logger = get_logger("r2p.web")
 
 LOOPBACK = "127.0.0.1"
 
-_MESSAGE_MAX = 1 << 20  # bytes of a message from a client
-_MESSAGES_MAX = 16  # that wait for their handler
+CONNECTIONS_MAX = 128
+"""Open connections, of clients and of others."""
+CLIENTS_MAX = 32
+"""Connections that speak WebSocket."""
+MESSAGE_MAX = 1 << 20
+"""Bytes of a message from a client."""
+
+_MESSAGES_MAX = 4  # of a client that wait for their handler
+_REQUEST_MAX = 1 << 14  # bytes of a request with its headers
+_REQUEST_TIME = 10.0  # seconds for a request and its answer
+_BACKLOG = 16  # connections that are accepted in one turn of the event loop
 _WRITE_BUFFER = 1 << 18  # bytes of a connection beyond which its client's own queue fills
-_CLIENTS_MAX = 64
 _CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -75,15 +90,43 @@ class WebOptions(msgspec.Struct, frozen=True, kw_only=True):
     origins: tuple[str, ...] = ()
 
 
+class _WebConnection(ServerConnection):
+    """A connection, which is `admitted` when it is made and `forgotten` when it is lost."""
+
+    def __init__(self, listener: "WebServer", *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._listener = listener
+        self._received = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._listener.admit(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._listener.forget(self)
+
+    def data_received(self, data: bytes) -> None:
+        if self.request is None:
+            self._received += len(data)
+            if self._received > _REQUEST_MAX:
+                self._listener.refused["request too long"] += 1
+                self.transport.abort()
+                return
+        super().data_received(data)
+
+
 class WebServer:
     """Serves `files` by path, and `endpoints` by path, while its block is open."""
 
     def __init__(
         self, options: WebOptions, endpoints: Mapping[str, WebEndpoint], files: Mapping[str, WebFile] | None = None
     ) -> None:
-        self.refused: dict[str, int] = {}
-        """Connections that were refused, by reason."""
+        self.refused: Counter[str] = Counter()
+        """Connections and requests that were refused, by reason."""
         self.clients: list[WebClient] = []
+        self._others: dict[_WebConnection, None] = {}
+        """Connections that are not those of clients, the oldest first (the values mean nothing)."""
         self._options = options
         self._endpoints = endpoints
         self._files = files or {}
@@ -119,7 +162,10 @@ class WebServer:
                 process_request=self._answer,
                 select_subprotocol=self._select_subprotocol,
                 compression=None,
-                max_size=_MESSAGE_MAX,
+                create_connection=functools.partial(_WebConnection, self),  # type: ignore[arg-type]  # it is called
+                open_timeout=_REQUEST_TIME,
+                backlog=_BACKLOG,
+                max_size=MESSAGE_MAX,
                 max_queue=_MESSAGES_MAX,
                 write_limit=_WRITE_BUFFER,
                 server_header=None,
@@ -138,37 +184,65 @@ class WebServer:
         self._server.close()
         await self._server.wait_closed()
 
+    # Connections
+
+    def admit(self, connection: _WebConnection) -> None:
+        """Note a new connection; beyond the limit, close the oldest one that is not a client's."""
+        self._others[connection] = None
+        if len(self._others) + len(self.clients) > CONNECTIONS_MAX:
+            oldest = next(iter(self._others))
+            del self._others[oldest]
+            self.refused["too many connections"] += 1
+            oldest.transport.abort()
+
+    def forget(self, connection: _WebConnection) -> None:
+        """Note the end of a connection."""
+        self._others.pop(connection, None)
+        if connection.response is None:
+            self.refused["no request"] += 1
+
     # A request
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the answer to a request; None for a WebSocket that may open."""
-        path = urlsplit(request.path).path
+        if getattr(request, "method", "GET") != "GET":  # websockets before 16 refuses others itself
+            return self._refuse(http.HTTPStatus.METHOD_NOT_ALLOWED, "not GET")
+        try:
+            return self._refusal(request) if "Upgrade" in request.headers else self._page(request)
+        except (ValueError, LookupError):  # an address that is none, or a header that is there twice
+            return self._refuse(http.HTTPStatus.BAD_REQUEST, "malformed request")
+
+    def _page(self, request: Request) -> Response:
         if not self._is_own_host(request.headers):
             return self._refuse(http.HTTPStatus.FORBIDDEN, "unknown host")
-        if "Upgrade" not in request.headers:
-            return self._file(path)
-        if path not in self._endpoints:
+        return self._file(urlsplit(request.path).path)
+
+    def _refusal(self, request: Request) -> Response | None:
+        """Return why a WebSocket may not open; None if it may."""
+        if not self._is_own_host(request.headers):
+            return self._refuse(http.HTTPStatus.FORBIDDEN, "unknown host")
+        if urlsplit(request.path).path not in self._endpoints:
             return self._refuse(http.HTTPStatus.NOT_FOUND, "unknown path")
         if not self._is_own_origin(request.headers):
             return self._refuse(http.HTTPStatus.FORBIDDEN, "origin")
         if not self._has_token(request):
             return self._refuse(http.HTTPStatus.UNAUTHORIZED, "token")
-        if len(self.clients) >= _CLIENTS_MAX:
+        if len(self.clients) >= CLIENTS_MAX:
             return self._refuse(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many clients")
         return None
 
     def _file(self, path: str) -> Response:
         file = self._files.get("/index.html" if path == "/" else path)
         if file is None:
-            return _response(http.HTTPStatus.NOT_FOUND, WebFile("text/plain", b"not found\n"))
+            return self._refuse(http.HTTPStatus.NOT_FOUND, "unknown path")
         return _response(http.HTTPStatus.OK, file)
 
     def _refuse(self, status: http.HTTPStatus, reason: str) -> Response:
-        self.refused[reason] = self.refused.get(reason, 0) + 1
+        self.refused[reason] += 1
         return _response(status, WebFile("text/plain", f"{status.phrase}: {reason}\n".encode()))
 
     def _is_own_host(self, headers: Headers) -> bool:
-        """Return whether a request names an address of this computer, not a name that somebody else's DNS gives it."""
+        """Return whether a request names an address of this computer, not a name that a stranger's DNS gives it."""
         host = urlsplit(f"//{headers.get('Host', '')}").hostname or ""
         return host == "localhost" or host == self._options.host or _is_address(host)
 
@@ -198,8 +272,12 @@ class WebServer:
             return
         async with WebClient(connection) as client:
             self.clients.append(client)
+            self._others.pop(cast("_WebConnection", connection), None)
             try:
                 await endpoint.handle(client)
+            except Exception:
+                logger.exception("internal error: the connection of a client ends")
+                await connection.close(1011, "internal error: see the log")
             finally:
                 self.clients.remove(client)
 

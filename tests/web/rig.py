@@ -33,6 +33,8 @@ class FakeConnection:
 
     def __init__(self) -> None:
         self.sent: list[str | bytes] = []
+        self.messages: list[dict[str, Any]] = []
+        """What was sent as JSON."""
         self.closed: tuple[int, str] | None = None
         self.reads = asyncio.Event()
         self.reads.set()
@@ -43,6 +45,8 @@ class FakeConnection:
         if self.closed is not None:
             raise ConnectionClosedOK(Close(1000, ""), None)
         self.sent.append(message)
+        if isinstance(message, str) and message.startswith("{"):
+            self.messages.append(json.loads(message))
 
     async def close(self, code: int, reason: str) -> None:
         self.closed = code, reason
@@ -72,7 +76,7 @@ class FakePage:
     @property
     def messages(self) -> list[dict[str, Any]]:
         """What has come as JSON."""
-        return [json.loads(each) for each in self.connection.sent if isinstance(each, str)]
+        return self.connection.messages
 
     @property
     def points(self) -> list[bytes]:

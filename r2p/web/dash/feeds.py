@@ -44,6 +44,7 @@ class PlotStream(msgspec.Struct, eq=False):
     client: WebClient
     number: int
     paths: list[str]
+    closed: bool = False
 
 
 class TopicFeeds:
@@ -66,18 +67,19 @@ class TopicFeeds:
         """Send points of a topic. Raises WebError for an unknown topic or type, MessageError for an unknown field."""
         cls = await self.find_type(topic)
         FieldExtractor(cls, stream.paths)
-        self._feed(topic).add_stream(stream, cls)
+        if not stream.closed:  # meanwhile
+            self._feed(topic).add_stream(stream, cls)
 
     def stop_plot(self, topic: str, stream: PlotStream) -> None:
         """Send no more points."""
+        stream.closed = True
         if (feed := self._feeds.get(topic)) is not None:
             feed.remove_stream(stream)
             self._release(feed)
 
-    async def watch(self, topic: str, client: WebClient) -> None:
+    def watch(self, topic: str, client: WebClient) -> None:
         """Send a page the newest messages of a topic. Raises WebError for an unknown topic."""
         self._check(topic)
-        await self.types.find(topic)
         self._feed(topic).add_watch(client)
 
     def unwatch(self, topic: str, client: WebClient) -> None:
@@ -155,11 +157,14 @@ class TopicFeed:
         self._plots.rebuild(cls)
 
     def remove_stream(self, stream: PlotStream) -> None:
-        self._plots.streams.remove(stream)
-        self._plots.rebuild(self.cls)
+        if stream in self._plots.streams:
+            self._plots.streams.remove(stream)
+            self._plots.rebuild(self.cls)
 
     def add_watch(self, client: WebClient) -> None:
         self._watches.add(client)
+        if self.cls is None:
+            self.learn_type()
 
     def remove_watch(self, client: WebClient) -> None:
         self._watches.clients.pop(client, None)

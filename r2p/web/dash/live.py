@@ -163,7 +163,8 @@ class LiveSession(SourceSession):
         try:
             await self._source.feeds.plot(topic, stream)
         except BaseException:
-            self._streams.pop(request.stream, None)
+            if self._streams.get(request.stream) == (topic, stream):
+                del self._streams[request.stream]
             raise
 
     async def _stop_plot(self, request: protocol.StopPlot) -> None:
@@ -179,12 +180,8 @@ class LiveSession(SourceSession):
             return
         if len(self._watched) >= WATCHES_MAX:
             raise WebError(f"a page watches at most {WATCHES_MAX} topics: close one")
+        self._source.feeds.watch(request.topic, self._client)
         self._watched.add(request.topic)
-        try:
-            await self._source.feeds.watch(request.topic, self._client)
-        except BaseException:
-            self._watched.discard(request.topic)
-            raise
 
     async def _unwatch(self, request: protocol.Unwatch) -> None:
         if request.topic in self._watched:

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from r2p.errors import WebError
@@ -27,6 +27,7 @@ class PageLog:
         self._client = client
         self._waiting: deque[LogEntry] = deque(maxlen=WAITING_MAX)
         self._dropped = 0
+        self._cleared = False
         self._timer: asyncio.TimerHandle | None = None
 
     def add(self, entry: LogEntry) -> None:
@@ -38,6 +39,14 @@ class PageLog:
         if self._timer is None:
             self._timer = asyncio.get_running_loop().call_later(PERIOD, self._send)
 
+    def begin(self, level: int, records: Iterable[LogEntry]) -> None:
+        """Begin anew, from a level on, with these records."""
+        self.level = level
+        self._cleared = True
+        self._waiting.clear()
+        for entry in records:
+            self.add(entry)
+
     def close(self) -> None:
         """Send no more."""
         if self._timer is not None:
@@ -47,8 +56,12 @@ class PageLog:
         self._timer = None
         records = [record(each) for each in self._waiting]
         self._waiting.clear()
-        news = protocol.encode({"op": "log", "records": records, "dropped": self._dropped}).decode()
-        if not self._client.send_newest(news, "log"):
+        news = {"op": "log", "records": records, "dropped": self._dropped}
+        if self._cleared:
+            news["cleared"] = True
+        if self._client.send_newest(protocol.encode(news).decode(), "log"):
+            self._cleared = False
+        else:
             self._dropped += len(records)
 
 
@@ -75,20 +88,19 @@ class LogFeed:
         """Send a page the newest records that are known, and then each one. Raises WebError for an unknown level."""
         if level not in LEVELS:
             raise WebError(f"{level[:20]!r} is not a level of the log: write one of {', '.join(LEVELS)}")
-        page.level = LEVELS[level]
         if page not in self._pages:
             self._pages.append(page)
         if self._follower is None:
             self._follower = self._follow()
             self._follower.listeners.append(self._add_record)
             await self._follower.__aenter__()
-        for entry in self._follower.records:
-            page.add(entry)
+        page.begin(LEVELS[level], self._follower.records)
 
     async def remove(self, page: PageLog) -> None:
         """Send a page no more records; without another page the subscription ends."""
         page.close()
-        self._pages.remove(page)
+        if page in self._pages:
+            self._pages.remove(page)
         if not self._pages:
             await self.close()
 

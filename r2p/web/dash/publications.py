@@ -39,12 +39,13 @@ class Publications:
         if not 0 <= request.rate <= RATE_MAX:
             raise WebError(f"a page publishes at most {RATE_MAX:g} messages per second, not {request.rate:g}")
         publisher, message = await self._prepare(request)
-        await self._stop(request.topic)
         await self._wait_for_subscriber(publisher)
-        await publisher.publish(message)
+        while request.topic in self._repeating:
+            await self._stop(request.topic)
         if request.rate:
             task = asyncio.create_task(self._repeat(request.topic, publisher, message, request.rate))
             self._repeating[request.topic] = task
+        await publisher.publish(message)
         return {"subscribers": publisher.subscribers}
 
     async def stop(self, request: protocol.StopPublishing) -> None:

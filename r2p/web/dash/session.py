@@ -28,8 +28,11 @@ REQUESTS_MAX = 32
 REQUEST_RATE = 200.0
 """Requests of one page per second, in the long run; beyond that it waits."""
 
+REQUEST_BYTES = 4 << 20
+"""Bytes of the requests of one page per second, in the long run."""
+
 _TABLES = ("modules", "topics", "services", "links", "buses")
-_BURST = 200  # requests of a page that do not wait, as when it opens
+_BURST = 1.0  # seconds of requests at these rates that do not wait, as when a page opens
 _ROWS = 500  # of one message with figures
 _DROPPED_PERIOD = 1.0  # seconds between two reports of what a page was too slow for
 _ERROR_MAX = 1000  # characters of an error
@@ -72,11 +75,15 @@ class _Page:
     async def serve(self, tasks: asyncio.TaskGroup) -> None:
         """Answer requests until the page leaves; then end those that are worked on."""
         loop = asyncio.get_running_loop()
-        allowed_at = loop.time() - _BURST / REQUEST_RATE
+        paid_until = 0.0
         async for message in self._client:
-            allowed_at = max(allowed_at + 1 / REQUEST_RATE, loop.time() - _BURST / REQUEST_RATE)
-            if allowed_at > loop.time():
-                await asyncio.sleep(allowed_at - loop.time())
+            cost = 1 / REQUEST_RATE + len(message) / REQUEST_BYTES
+            paid_until = max(paid_until, loop.time() - _BURST) + cost
+            if paid_until > loop.time():
+                await asyncio.sleep(paid_until - loop.time())
+            if len(self._running) >= REQUESTS_MAX:  # most are answered as soon as they run
+                await asyncio.sleep(0)
+                await asyncio.sleep(0)  # and no longer counted a turn later
             self._begin(tasks, message)
         for task in self._running:
             task.cancel()
@@ -120,7 +127,7 @@ async def _report(client: WebClient) -> None:
         await asyncio.sleep(_DROPPED_PERIOD)
         if client.dropped.total() > reported:
             reported = client.dropped.total()
-            await client.drained()
+            await client.room()
             client.send(protocol.encode({"op": "dropped", "streams": dict(client.dropped)}).decode())
 
 
@@ -159,7 +166,7 @@ async def _send_states(session: SourceSession, client: WebClient, states: StateE
         while True:
             snapshot = await session.snapshots()
             for message in states.messages(before, snapshot):
-                await client.drained()
+                await client.room()
                 client.send(message)
             before = states.tables(snapshot)
 
