@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-import r2p
 from r2p.msg import Odometry
 from r2p.tools import dash
 from r2p.tools.session import UsageError
 from r2p.tools.topic.plot import plot
 from r2p.web.dash.live import LiveSource
 from tests.tools.rig import robot, tool
+
+if TYPE_CHECKING:
+    import r2p
 
 pytestmark = pytest.mark.virtual_time
 
