@@ -34,6 +34,7 @@ async def plot(
     The page is served by this command, only to this computer, until Ctrl-C. Its address is printed.
     """
     from r2p.tools import dash  # only here: the extra `web` may not be installed, and other commands do not need it
+    from r2p.web.server import WebOptions
 
     for topic, paths in _by_topic(fields).items():
         cls = await find(session, topic, None)
@@ -42,7 +43,7 @@ async def plot(
         except r2p.MessageError as error:
             raise UsageError(f"{topic}: {error}") from error
     async with dash.live_source(session) as source:
-        await dash.serve(session, source, dash.WebOptions(port=port), view=f"/plots/{','.join(fields)}", open=open)
+        await dash.serve(session, source, WebOptions(port=port), view=f"/plots/{','.join(fields)}", open=open)
 
 
 def _by_topic(fields: list[str]) -> dict[str, list[str]]:

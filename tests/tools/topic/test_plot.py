@@ -11,6 +11,7 @@ from r2p.tools import dash
 from r2p.tools.session import UsageError
 from r2p.tools.topic.plot import plot
 from r2p.web.dash.live import LiveSource
+from r2p.web.server import WebOptions
 from tests.tools.rig import robot, tool
 
 if TYPE_CHECKING:
@@ -28,14 +29,15 @@ async def _drive(node: r2p.Node) -> None:
 async def test_fields_are_checked_and_the_page_opens_with_them(monkeypatch: pytest.MonkeyPatch) -> None:
     served: list[dict[str, Any]] = []
 
-    async def serve(_session: object, source: object, **options: Any) -> None:
+    async def serve(_session: object, source: object, options: WebOptions, **others: Any) -> None:
         assert isinstance(source, LiveSource)
-        served.append(options)
+        assert options == WebOptions(port=0)
+        served.append(others)
 
     monkeypatch.setattr(dash, "serve", serve)
     async with robot(_drive), tool() as session:
         await plot(session, ["odometry.pose.x", "odometry.velocity.w"], port=0, open=False)
-        assert served == [{"port": 0, "view": "/plots/odometry.pose.x,odometry.velocity.w", "open": False}]
+        assert served == [{"view": "/plots/odometry.pose.x,odometry.velocity.w", "open": False}]
         with pytest.raises(UsageError, match=r"has no number 'pose\.z'; it has pose\.x, pose\.y"):
             await plot(session, ["odometry.pose.z"], port=0, open=False)
         with pytest.raises(UsageError, match=r"odometry names no field: write odometry\.FIELD"):

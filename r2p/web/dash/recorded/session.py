@@ -195,7 +195,7 @@ class RecordedSession(SourceSession):
                     "damaged": len(self._source.reader.damaged),
                 }
             )
-            await self._client.drained()
+            await self._client.room()
             if share == 1 and is_all:
                 return
             if is_all:
