@@ -29,11 +29,14 @@ from rich.style import Style
 from rich.text import Text
 
 from r2p import sim
-from r2p.sim.robots.figures import Figures
+from r2p.monitoring.monitor import NetworkMonitor
+from r2p.sim.robots.figures import RobotFigures
 from r2p.tools import doctor, simulator
 from r2p.tools.main import app
 from r2p.tools.session import Settings, join
 from r2p.tools.simulator import SimulatorScreen, simulate
+from r2p.tools.top.app import TopApp
+from r2p.tools.top.topic_screen import TopicScreen
 from r2p.tools.topic.rates import hz
 from r2p.transports.can.netlink import Interface
 
@@ -64,8 +67,10 @@ _STYLE = """
     .cyan { fill: #5fd3e0 }
     .green { fill: #7fd88f }
     .yellow { fill: #f2cc60 }
-    .red { fill: #ff8178 }"""
-_COLOURS = {1: "red", 2: "green", 3: "yellow", 6: "cyan"}  # of ANSI
+    .red { fill: #ff8178 }
+    .blue { fill: #7aa8ff }
+    .magenta { fill: #d79bf0 }"""
+_COLOURS = {1: "red", 2: "green", 3: "yellow", 4: "blue", 5: "magenta", 6: "cyan"}  # of ANSI
 _CHUNK = re.compile(r"\S+(?: \S+)*")  # words with single blanks between them: each chunk has a position of its own
 
 
@@ -181,7 +186,7 @@ async def _robot() -> dict[str, Screen]:
     screens: dict[str, Screen] = {}
     seen = asyncio.Event()
 
-    def show(screen: SimulatorScreen, figures: Figures) -> None:
+    def show(screen: SimulatorScreen, figures: RobotFigures) -> None:
         screen.draw(figures)  # its map remembers the path
         if not seen.is_set() and figures.time >= MOMENT - 0.01:
             seen.set()
@@ -195,6 +200,7 @@ async def _robot() -> dict[str, Screen]:
             async with join(Settings(via=[_OUTSIDE]), name="hz") as session:
                 await hz(session, "odometry", count=3)
         screens["hz"] = Screen("r2p topic hz odometry -n 3", terminal.getvalue())
+        screens |= await _top()
         await seen.wait()
         robot.cancel()
         with contextlib.suppress(asyncio.CancelledError):
@@ -202,7 +208,34 @@ async def _robot() -> dict[str, Screen]:
     return screens
 
 
-def _frame(screen: SimulatorScreen, figures: Figures, columns: int, lines: int) -> Screen:
+async def _top() -> dict[str, Screen]:
+    """The tables of `r2p top`, and what opens from them."""
+    screens, command = {}, f"r2p top --via {_ADDRESS}"
+    async with join(Settings(via=[_OUTSIDE]), name="top") as session, NetworkMonitor(session.module) as monitor:
+        for topic in ("odometry", "encoder1", "velocity"):
+            monitor.measure(topic)
+        app = TopApp(session, monitor)
+        async with app.run_test(size=(COLUMNS, 24)) as pilot:
+            await pilot.pause(2.1)
+            screens["top"] = Screen(command, _ansi(app))
+            # Without keys: after each of them the pilot waits until the process is idle, by the processor's clock.
+            app.tables.action_view("buses")
+            await pilot.pause(0.1)
+            screens["top-bus"] = Screen(command, _ansi(app))
+            await app.push_screen(TopicScreen(app.details, "odometry"))
+            await pilot.pause(6.0)
+            screens["top-topic"] = Screen(command, _ansi(app))
+    return screens
+
+
+def _ansi(app: TopApp) -> str:
+    """What the terminal of an app shows."""
+    console = Console(file=io.StringIO(), width=COLUMNS, **_COLOURED)
+    strips = app.screen._compositor.render_strips()  # noqa: SLF001 - Textual's own export is a picture, not a text
+    return "\n".join(strip.render(console) for strip in strips)
+
+
+def _frame(screen: SimulatorScreen, figures: RobotFigures, columns: int, lines: int) -> Screen:
     """One frame of the demo, on a terminal of this size."""
     output = io.StringIO()
     size = {"width": columns, "height": lines}

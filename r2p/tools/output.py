@@ -52,7 +52,9 @@ class Output:
     `format` None: "text" at a terminal, else "json". Records contain numbers, texts, lists and nested records.
     """
 
-    def __init__(self, format: Literal["yaml", "json", "csv"] | None = None, stream: TextIO | None = None) -> None:
+    def __init__(
+        self, format: Literal["text", "yaml", "json", "csv"] | None = None, stream: TextIO | None = None
+    ) -> None:
         self._stream = stream or sys.stdout
         self.format = format or ("text" if self._stream.isatty() else "json")
         """"text", "yaml", "json" or "csv"."""
@@ -130,6 +132,11 @@ class Output:
                 text = _csv(columns) + "".join(_csv([_cell(row[name]) for name in columns]) for row in rows)
             case _:
                 text = "".join(self._record({name: row[name] for name in columns}, None) for row in rows)
+        async with self._lock:
+            await self._write(text)
+
+    async def raw(self, text: str) -> None:
+        """Write a text as it is, in every format: a file in a language of its own. Raises PipeClosed."""
         async with self._lock:
             await self._write(text)
 

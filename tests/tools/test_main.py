@@ -33,7 +33,7 @@ def test_every_command_has_help(name: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "hint"),
     [
-        (["topc"], "Did you mean 'topic'?"),
+        (["topci"], "Did you mean 'topic'"),
         (["topic", "ehco"], "Did you mean 'echo'?"),
         (["topic", "echo"], "Missing"),
         (["topic", "echo", "a//c"], "topic name 'a//c': a part of it is empty: use letters, digits and underscores"),

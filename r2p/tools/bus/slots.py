@@ -32,7 +32,8 @@ _SHORTEST, _LONGEST = 1e-9, 1e9  # s; representable in ns, and above it surely a
 
 _ROW = 20  # slots in a line of text
 _SIDE = 26  # pixels of a slot in the SVG
-_LETTERS = string.ascii_uppercase.replace("S", "") + string.ascii_lowercase + string.digits
+SLOT_LETTERS = string.ascii_uppercase.replace("S", "") + string.ascii_lowercase + string.digits
+"""The letters of the owners of slots, in order; S is the sync's."""
 _COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#b07aa1", "#76b7b2", "#edc948", "#9c755f", "#ff9da7")
 _SYNC, _FREE, _EVENTS, _MISSED = "#555555", "#76808e26", "#4e79a766", "#d62728"  # free ones let a dark page through
 _STYLE = "<style>.label { fill: #333 } @media (prefers-color-scheme: dark) { .label { fill: #ddd } }</style>"
@@ -284,7 +285,7 @@ def drawing(cells: list[Cell]) -> list[str]:
 def _letters(cells: Iterable[Cell]) -> dict[str, str]:
     """Return the letter of each owner, in order of appearance; all beyond the last letter share that."""
     owners = dict.fromkeys(cell.owner for cell in cells if cell.owner not in {"", "sync"})
-    return {owner: _LETTERS[min(i, len(_LETTERS) - 1)] for i, owner in enumerate(owners)}
+    return {owner: SLOT_LETTERS[min(i, len(SLOT_LETTERS) - 1)] for i, owner in enumerate(owners)}
 
 
 def _glyph(cell: Cell, names: dict[str, str]) -> str:
@@ -335,4 +336,4 @@ def _box(index: int, cell: Cell, x: int, y: int, names: dict[str, str]) -> str:
 
 
 def _colour(letter: str) -> str:
-    return _COLOURS[_LETTERS.index(letter) % len(_COLOURS)]
+    return _COLOURS[SLOT_LETTERS.index(letter) % len(_COLOURS)]
