@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.browser.rig import opened, serve
+from tests.browser.rig import Dash, opened, serve
 from tests.tools.rig import process
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ TRY = """url => new Promise(resolve => {
     socket.onopen = () => resolve("open")
     socket.onerror = () => resolve("refused")
 })"""
+HANG = "time => { const end = performance.now() + time; while (performance.now() < end); }"  # ms
 ASK = "([op, values]) => r2p.connection.request(op, values).then(() => 'done', error => error.message)"
 FORBIDDEN = {
     ("publish", "--allow-publish"): {"topic": "leds", "value": {"led": 1, "value": 1}},
@@ -90,3 +92,17 @@ async def test_what_is_not_allowed_is_refused_and_the_option_is_named(browser: B
         for (op, option), values in FORBIDDEN.items():
             answer = await tab.evaluate(ASK, [op, values])
             assert option in answer, f"{op}: {answer}"
+
+
+async def test_a_page_that_hangs_keeps_no_other_waiting_and_goes_on_with_the_newest(
+    browser: Browser, dash: Dash
+) -> None:
+    async with opened(browser, dash.server.url) as slow, opened(browser, dash.server.url) as other:
+        for tab in (slow, other):
+            await tab.until("r2p.store.topics.has('odometry')")
+        hanging = asyncio.create_task(slow.evaluate(HANG, 2500))
+        began = await other.evaluate("() => r2p.store.time")
+        await other.until("r2p.store.time > argument", began)
+        assert not hanging.done()
+        await hanging
+        await slow.until("r2p.store.time >= argument", dash.monitor.snapshot.time)

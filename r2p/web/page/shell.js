@@ -185,8 +185,8 @@ export class Shell {
     openDialog({
       title: "Keys",
       body: [
-        keysTable(KEYS),
-        this.#view?.keys ? [h("h3", {}, this.#view.title), keysTable(this.#view.keys)] : [],
+        keysTable("Keys", KEYS),
+        this.#view?.keys ? [h("h3", {}, this.#view.title), keysTable(`Keys of ${this.#view.title}`, this.#view.keys)] : [],
         h("p", { class: "dim" }, [
           `r2p ${hello?.version ?? ""}`, plural(store.topics.size, "topic"), ...allowed,
         ].join(" · ")),
@@ -199,7 +199,7 @@ function isTyping(element) {
   return element.isContentEditable || element.matches?.("textarea, select, input:not([type=checkbox]):not([type=radio])")
 }
 
-function keysTable(keys) {
+function keysTable(name, keys) {
   const rows = keys.map(([key, act]) => h("tr", {}, h("th", { scope: "row" }, h("kbd", {}, key)), h("td", {}, act)))
-  return h("table", { class: "keys" }, h("tbody", {}, rows))
+  return h("table", { class: "keys", "aria-label": name }, h("tbody", {}, rows))
 }
