@@ -10,8 +10,11 @@
     return `<${element.localName}${own}> ${element.textContent.trim().replace(/\s+/g, " ").slice(0, 40)}`.trim()
   }
   const report = (what, element) => problems.push(element ? `${what}: ${name(element)}` : what)
-  const isShown = element => element.checkVisibility({ opacityProperty: true, visibilityProperty: true })
-    && element.getClientRects().length > 0
+  const isShown = element => {
+    const box = element.getBoundingClientRect() // of one pixel is what only screen readers get
+    const isVisible = element.checkVisibility({ opacityProperty: true, visibilityProperty: true })
+    return isVisible && (box.width > 1 || box.height > 1)
+  }
   const all = selector => [...document.querySelectorAll(selector)].filter(isShown)
 
   // Colours
@@ -106,7 +109,7 @@
     if (own > level + 1) report(`a heading h${own} after h${level}`, heading)
     level = own
   }
-  if (all("h1").length !== 1) report(`${all("h1").length} headings h1`)
+  if (document.querySelectorAll("h1").length !== 1) report(`${document.querySelectorAll("h1").length} headings h1`)
   if (all("main").length !== 1) report(`${all("main").length} elements main`)
   if (!document.documentElement.lang) report("the page has no language")
   if (!document.title) report("the page has no title")
