@@ -18,6 +18,7 @@ ALL = (
     "ros1",
     "ros2",
     "gateway",
+    "foxglove",
     "recording",
     "recording_edit",
     "rtcan",

@@ -15,7 +15,7 @@ PICTURE = Path(__file__).parent / "assets" / "architecture.svg"
 
 LAYERS: dict[str, tuple[str, ...]] = {
     "Commands, test tools": ("tools", "testing"),
-    "Web pages, Foxglove": ("web", "web.dash"),
+    "Web pages, Foxglove": ("web", "web.dash", "web.foxglove"),
     "Recordings": ("recording",),
     "Monitoring": ("monitoring",),
     "Simulation, boot loader, ROS": (

@@ -74,12 +74,18 @@ async def _publish_poses(node: Node, type: type[r2p.msg.Odometry] | type[r2p.msg
     poses = node.subscribe("odometry", type, lossy=True)
     stamps = StampSource(type, Counter())
     async for sample in poses.samples():
-        pose = sample.message.pose
         try:
-            stamp = Timestamp.from_ns(stamps.find(sample))
-            rotation = quaternion(Quaternion, 0.0, 0.0, pose.w)
+            message = transforms_of(sample.message.pose, stamps.find(sample), frame.value, child.value)
         except MessageError:  # of a module whose clock is beyond 2106, or with an infinite angle
             continue
-        header = r2p.msg.Header(stamp=stamp, frame_id=frame.value)
-        place = Transform(Vector3(pose.x, pose.y), rotation)
-        await transforms.publish(TFMessage((TransformStamped(header, child.value, place),)))
+        await transforms.publish(message)
+
+
+def transforms_of(pose: r2p.msg.Pose3, ns: int, frame: str, child: str) -> TFMessage:
+    """Return a pose as the transform from one frame to another at `ns` (UTC).
+
+    Raises MessageError for a time outside of 1970 to 2106, and for an infinite angle.
+    """
+    header = r2p.msg.Header(stamp=Timestamp.from_ns(ns), frame_id=frame)
+    place = Transform(Vector3(pose.x, pose.y), quaternion(Quaternion, 0.0, 0.0, pose.w))
+    return TFMessage((TransformStamped(header, child, place),))

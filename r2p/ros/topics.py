@@ -134,7 +134,7 @@ class TopicTypes:
     def _same(self, cls: type[Message], theirs: type[Message], kind: RosType) -> RosTopic:
         """Return how a class travels as a type with the same fields."""
         shape = layout(cls)
-        fill = _header_stamps(shape, self._counts) if _has_header(shape) else None
+        fill = header_filler(shape, self._counts) if has_header(shape) else None
         if self.version == 1:
             return RosTopic(shape, kind, _packed(shape, fill), _unpacked(shape))
         return RosTopic(shape, kind, _to_cdr(theirs, fill), _from_cdr(shape, theirs))
@@ -184,7 +184,8 @@ def _utc(stamp: Timestamp | None) -> int:
 # Types with the same fields on both sides
 
 
-def _has_header(shape: Layout[Any]) -> bool:
+def has_header(shape: Layout[Any]) -> bool:
+    """Return whether messages begin with a Header, whose stamp says when they were made."""
     header = next((each.shape for each in shape.fields if each.name == "header"), None)
     return header is not None and getattr(getattr(header, "layout", None), "name", "") == "std_msgs/Header"
 
@@ -193,7 +194,7 @@ Fill = Callable[[Sample], Message | None]
 """Returns the message of a sample with its stamp in the header; None if the bytes of the sample have it already."""
 
 
-def _header_stamps(shape: Layout[Any], counts: Counter[str]) -> Fill:
+def header_filler(shape: Layout[Any], counts: Counter[str]) -> Fill:
     """Return the filler of `header.stamp` for messages without a stamp of their own, or with one of another clock."""
     source = StampSource(shape.cls, counts)
 

@@ -40,6 +40,7 @@ COMMANDS = {
     "top": ("r2p.tools.top", "Show topics, modules and buses with their figures, as they change."),
     "dash": ("r2p.tools.dash", "Show the network, or a recording, in a browser."),
     "graph": ("r2p.tools.graph", "Show or draw which nodes publish which topics to which nodes."),
+    "foxglove": ("r2p.tools.foxglove", "Serve the network to Foxglove and PlotJuggler."),
     "log": ("r2p.tools.log", "Print the log records of all modules."),
     "wait": ("r2p.tools.waiting", "Wait until a topic, node or module is there, for scripts."),
     "doctor": ("r2p.tools.doctor", "Check what this machine has and lacks for r2p, or try a link."),

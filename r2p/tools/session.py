@@ -407,10 +407,11 @@ def joined(
     keep_trying: bool = False,
     check: Check | None = None,
     joins: Joins = lambda _given: True,
+    loop: Callable[..., Run | None] | None = None,
 ) -> Callable[..., None]:
     """Make a command for `main.COMMANDS` of a coroutine function that takes a Session, or what `opening` opens.
 
-    `check` comes before any link is opened, whose warnings would stand above its error.
+    `check` comes before any link is opened, whose warnings would stand above its error. `loop` is as in `standalone`.
     Unless it is to `keep_trying`, the command fails as soon as no link can come up. Where it does not join (`joins`),
     its session has no links.
     """
@@ -434,7 +435,8 @@ def joined(
                 else:
                     await while_connected(opened, body(opened, **given))
 
-        execute(main, verbose=verbose, quiet=quiet, endless=endless(given))
+        replaced = None if loop is None else loop(**given)
+        execute(main, verbose=verbose, quiet=quiet, endless=endless(given), run=replaced)
 
     return _with_options(run, body, session=True)
 

@@ -28,6 +28,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from r2p.clock import real_time
 from r2p.errors import WebError
 from r2p.log_lines import get_logger
 from r2p.web.client import WebClient
@@ -46,6 +47,7 @@ MESSAGE_MAX = 1 << 20
 _MESSAGES_MAX = 4  # of a client that wait for their handler
 _REQUEST_MAX = 1 << 14  # bytes of a request with its headers
 _REQUEST_TIME = 10.0  # seconds for a request and its answer
+_ORIGINS_MAX = 16  # refused pages whose names are kept
 _BACKLOG = 16  # connections that are accepted in one turn of the event loop
 _WRITE_BUFFER = 1 << 18  # bytes of a connection beyond which its client's own queue fills
 _CSP = (
@@ -124,6 +126,8 @@ class WebServer:
     ) -> None:
         self.refused: Counter[str] = Counter()
         """Connections and requests that were refused, by reason."""
+        self.foreign_origins: set[str] = set()
+        """Pages that were refused, a few of them."""
         self.clients: list[WebClient] = []
         self._others: dict[_WebConnection, None] = {}
         """Connections that are not those of clients, the oldest first (the values mean nothing)."""
@@ -155,27 +159,31 @@ class WebServer:
     async def __aenter__(self) -> Self:
         """Begin to listen. Raises WebError if the address can't be used."""
         try:
-            self._server: Server = await serve(
-                self._handle,
-                self._options.host,
-                self._options.port,
-                process_request=self._answer,
-                select_subprotocol=self._select_subprotocol,
-                compression=None,
-                create_connection=functools.partial(_WebConnection, self),  # type: ignore[arg-type]  # it is called
-                open_timeout=_REQUEST_TIME,
-                backlog=_BACKLOG,
-                max_size=MESSAGE_MAX,
-                max_queue=_MESSAGES_MAX,
-                write_limit=_WRITE_BUFFER,
-                server_header=None,
-                logger=_quiet,
-            )
+            with real_time():  # time-outs of clients, which have nothing to do with the time of a simulation
+                self._server = await self._listen()
         except OSError as error:
             where = f"{self._options.host}:{self._options.port}"
             text = f"can't listen on {where}: {error.strerror or error}; choose another --port, or 0 for a free one"
             raise WebError(text) from error
         return self
+
+    async def _listen(self) -> Server:
+        return await serve(
+            self._handle,
+            self._options.host,
+            self._options.port,
+            process_request=self._answer,
+            select_subprotocol=self._select_subprotocol,
+            compression=None,
+            create_connection=functools.partial(_WebConnection, self),  # type: ignore[arg-type]  # it is called
+            open_timeout=_REQUEST_TIME,
+            backlog=_BACKLOG,
+            max_size=MESSAGE_MAX,
+            max_queue=_MESSAGES_MAX,
+            write_limit=_WRITE_BUFFER,
+            server_header=None,
+            logger=_quiet,
+        )
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -223,7 +231,8 @@ class WebServer:
             return self._refuse(http.HTTPStatus.FORBIDDEN, "unknown host")
         if urlsplit(request.path).path not in self._endpoints:
             return self._refuse(http.HTTPStatus.NOT_FOUND, "unknown path")
-        if not self._is_own_origin(request.headers):
+        if foreign := self._foreign_origins(request.headers):
+            self.foreign_origins.update(foreign[: _ORIGINS_MAX - len(self.foreign_origins)])
             return self._refuse(http.HTTPStatus.FORBIDDEN, "origin")
         if not self._has_token(request):
             return self._refuse(http.HTTPStatus.UNAUTHORIZED, "token")
@@ -246,10 +255,10 @@ class WebServer:
         host = urlsplit(f"//{headers.get('Host', '')}").hostname or ""
         return host == "localhost" or host == self._options.host or _is_address(host)
 
-    def _is_own_origin(self, headers: Headers) -> bool:
-        origins = headers.get_all("Origin")
-        own = f"http://{headers.get('Host', '')}"
-        return all(each == own or each in self._options.origins for each in origins)
+    def _foreign_origins(self, headers: Headers) -> list[str]:
+        """Return the pages that a request comes from, if it is neither this server's nor one that is allowed."""
+        own = "", f"http://{headers.get('Host', '')}"  # programs that are not a browser send none, or an empty one
+        return [each for each in headers.get_all("Origin") if each not in own and each not in self._options.origins]
 
     def _has_token(self, request: Request) -> bool:
         if self.token is None:
