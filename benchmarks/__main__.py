@@ -24,6 +24,7 @@ ALL = (
     "rtcan",
     "timers",
     "playing",
+    "dash",
     "browser",
     "start",
     "socketcan",
