@@ -1,30 +1,19 @@
 """The page of `r2p dash` in Chromium: frames drawn of 20 fields at 1 kHz, and how soon it shows something."""
 
-import contextlib
-import os
-import re
-import subprocess
 import time
 from collections.abc import Iterator
-from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import r2p
-from benchmarks.loops import run_on
+from benchmarks.dash import RATE, dash, processor_time, robot
 from benchmarks.processes import process
-from benchmarks.start import COMMAND
 from benchmarks.table import Row, typical
-from r2p.transports.tcp import TcpListenTransport
-from r2p.transports.url import parse
 from tests.browser import install
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-TOPICS = 4
+TOPICS = 4  # as in the benchmark `dash`
 FIELDS = 5  # of each topic
-RATE = 1000.0  # messages a second of each
 SECONDS = 10.0
 RUNS = 5
 PATIENCE = 60_000  # ms
@@ -57,61 +46,11 @@ _PAINTED = """() => new Promise(resolve => {
 })"""
 
 
-class Five(r2p.Message):
-    """40 bytes, of fields that are plotted."""
-
-    a: r2p.f64 = 0.0
-    b: r2p.f64 = 0.0
-    c: r2p.f64 = 0.0
-    d: r2p.f64 = 0.0
-    e: r2p.f64 = 0.0
-
-
-def _robot(pipe: Connection) -> None:
-    """Publish until the process is ended."""
-    run_on("uvloop", _publish(pipe))
-
-
-async def _publish(pipe: Connection) -> None:
-    transport = TcpListenTransport(parse("tcp-listen:127.0.0.1:0"))
-
-    async def waves(node: r2p.Node) -> None:
-        publishers = [node.advertise(f"wave{number}", Five) for number in range(TOPICS)]
-        async for _ in node.every(1 / RATE):
-            value = publishers[0].sent % 1000 / 1000
-            for publisher in publishers:
-                publisher.publish_nowait(Five(value, -value, value * value, 1 - value, 0.5))
-
-    async with r2p.Module("ROBOT", via=[transport], watchdog=False) as module:
-        module.start(waves)
-        pipe.send(transport.port)
-        await module.wait()
-
-
-@contextlib.contextmanager
-def _dash(via: str) -> Iterator[tuple[int, str]]:
-    """`r2p dash` as users start it; its process and the address of its page."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    command = [COMMAND, "dash", "--port", "0", "--via", via]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as child:
-        try:
-            assert child.stderr is not None
-            yield child.pid, next(found[0] for line in child.stderr if (found := re.search(r"http://\S+", line)))
-        finally:
-            child.terminate()
-
-
-def _processor(pid: int) -> float:
-    """Seconds of processor time that a process has taken."""
-    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
-    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
-
-
 def _paint(browser: "Browser", via: str) -> float:
     """Return the seconds from the start of the process to the first text on the screen."""
     page = browser.new_page()
     began = time.time()
-    with _dash(via) as (_, url):
+    with dash(via) as (_, url):
         page.goto(url, wait_until="commit")
         painted: float = page.evaluate(_PAINTED)
         page.close()
@@ -121,14 +60,14 @@ def _paint(browser: "Browser", via: str) -> float:
 def _plot(browser: "Browser", via: str) -> tuple[dict[str, Any], float]:
     """Return what the page counts while it plots, and the share of a core that its server takes."""
     fields = [f"wave{topic}.{field}" for topic in range(TOPICS) for field in "abcde"]
-    with _dash(via) as (pid, url):
+    with dash(via) as (pid, url):
         page = browser.new_page()
         page.set_default_timeout(PATIENCE)
         page.goto(f"{url}#/plots/{','.join(fields)}")
         page.evaluate(_PLOTTED, int(TOPICS * FIELDS * RATE))
-        before, began = _processor(pid), time.perf_counter()
+        before, began = processor_time(pid), time.perf_counter()
         counted: dict[str, Any] = page.evaluate(_FRAMES, SECONDS)
-        share = (_processor(pid) - before) / (time.perf_counter() - began)
+        share = (processor_time(pid) - before) / (time.perf_counter() - began)
         page.close()
     return counted, share
 
@@ -148,7 +87,7 @@ def rows() -> Iterator[Row]:
         return
     from playwright.sync_api import sync_playwright  # it is not in every environment
 
-    with sync_playwright() as playwright, process(_robot) as pipe:
+    with sync_playwright() as playwright, process(robot, TOPICS) as pipe:
         browser = playwright.chromium.launch(executable_path=program, args=_OPTIONS)
         via = f"tcp:127.0.0.1:{pipe.recv()}"
         paint = typical(RUNS, lambda: _paint(browser, via))
