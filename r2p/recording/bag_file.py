@@ -70,12 +70,14 @@ class BagFile:
                 continue
             yield record.name, record.metadata
 
-    def attachments(self) -> Iterator[Attachment]:
-        """Yield the attachments that can be read."""
+    def attachments(self, name: str | None = None, most: int | None = None) -> Iterator[Attachment]:
+        """Yield the attachments that can be read; those of a name, if one is given, and of at most so many bytes."""
         for index in self.summary.attachments:
+            if name not in (None, index.name):
+                continue
             try:
                 opcode, length = self.file.head(index.offset)
-                if opcode != Opcode.ATTACHMENT:
+                if opcode != Opcode.ATTACHMENT or (most is not None and length > most):
                     continue
                 body = self.file.read(index.offset + RECORD_HEAD.size, length)
                 record = parse(AttachmentRecord, body)

@@ -83,8 +83,11 @@ def _some(entries: bytes, most: int | None) -> bytes:
 def _at_offsets(data: bytes, entries: bytes, wanted: frozenset[int]) -> list[MessageRecord]:
     """Return the messages at the offsets of an index. Raises ValueError where one is not there."""
     found: list[MessageRecord] = []
-    left = len(data)  # an index may name one long message a million times
-    for _, at in _ENTRY.iter_unpack(entries):
+    offsets = dict.fromkeys(at for _, at in _ENTRY.iter_unpack(entries))
+    if len(offsets) * _ENTRY.size != len(entries):  # it names one long message a million times
+        raise ValueError("the index is wrong")
+    left = len(data)
+    for at in offsets:
         if at > len(data) - MESSAGE_RECORD.size:
             raise ValueError("the index is wrong")
         opcode, length, channel, sequence, log_time, publish_time = MESSAGE_RECORD.unpack_from(data, at)

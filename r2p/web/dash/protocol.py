@@ -181,7 +181,7 @@ class Play(_Request, tag="play"):
 class ReadTimeline(_Request, tag="timeline"):
     """Answer with what is in a recording, and send what happened as news, while it is found.
 
-    {"start": ns, "end": ns, "step": ns of a step of misses, "files": [...], "problems": [...], "topics": {NAME: count}}
+    {"start": ns, "end": ns, "step": ns of a step of misses, "files": [...], "problems": [...]}
     """
 
 

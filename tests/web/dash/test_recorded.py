@@ -188,7 +188,7 @@ async def test_the_log_is_that_up_to_the_instant(recording: Path) -> None:
 async def test_the_time_line_has_events_misses_and_gaps(recording: Path) -> None:
     async with shown(recording) as (page, _):
         answer = await page.result("timeline")
-        assert (answer["start"], answer["topics"], answer["problems"]) == (T0, {"wheels": 1600}, [])
+        assert (answer["start"], answer["files"], answer["problems"]) == (T0, ["drive.mcap"], [])
         await news(page, "timeline", lambda each: each["share"] == 1)
         events = [event for each in page.news("timeline") for event in each["events"]]
         kinds = {each["kind"] for each in events}

@@ -49,8 +49,12 @@ _WINDOW = SECOND  # ns before the instant, for rates
 _STATISTICS_WITHIN = 15 * SECOND  # ns: on slow links, modules are asked each ten seconds
 _LOADS_WITHIN = 3 * SECOND  # ns: they are said once a second
 _CHUNKS_MAX = 64  # that are read for one instant: those of r2p last half a second each
-_ENTRIES_MAX = 4096  # of the statistics of a module
-_ATTACHMENT_MAX = 4 << 20  # bytes of the description of the network
+_ENTRIES_MAX = 1 << 16  # of the statistics of all modules together
+_MODULES_MAX = 1024
+_STATISTICS_MAX = 1 << 20  # bytes of an answer of a module
+_NAME_MAX = 512  # characters; what has a longer name is not shown
+_TOPICS_MAX = 10_000
+_ATTACHMENT_MAX = 1 << 20  # bytes of the description of the network
 _CLASSES = {
     PublisherClass.PERIODIC: "periodic",
     PublisherClass.SPORADIC: "sporadic",
@@ -82,11 +86,11 @@ class _Answers(msgspec.Struct):
     statistics: ModuleStatistics
     earlier: ModuleStatistics | None = None
 
-    def counters(self, module: str) -> ModuleCounters:
-        """Return the counters of the module."""
+    def counters(self, module: str, room: int) -> ModuleCounters:
+        """Return the counters of the module, with at most `room` entries."""
         found = ModuleCounters()
         for each in filter(None, (self.earlier, self.statistics)):
-            found.update(module, each, _ENTRIES_MAX)
+            found.update(module, each, room)
         return found
 
 
@@ -129,9 +133,16 @@ class _Contents:
         self.observed_names = {each.name for each in bag.channels if _is_observed(each)}
         self.channels: dict[str, list[BagChannel]] = defaultdict(list)
         """The channels with samples of each topic."""
+        self.left_out = 0
+        """Channels that are not shown, as there are too many, or their names are too long."""
         for each in bag.channels:
-            if each.kind == "samples" and each.info is not None:
-                self.channels[each.info.topic].append(each)
+            if each.kind != "samples" or each.info is None:
+                continue
+            topic, known = each.info.topic, len(self.channels)
+            if _is_short(each) and (topic in self.channels or known < _TOPICS_MAX):
+                self.channels[topic].append(each)
+            else:
+                self.left_out += 1
         self.nodes = _described_nodes(bag)
 
     def publishers(self, topic: str) -> dict[Node, PublisherFigures]:
@@ -146,27 +157,29 @@ class _Contents:
         return found
 
 
+def _is_short(channel: BagChannel) -> bool:
+    """Return whether the names of a channel are no longer than those of a network can be, by far."""
+    info = channel.info
+    names = (channel.name, channel.type_name, *((info.module, info.node, info.link) if info is not None else ()))
+    return max(map(len, names)) <= _NAME_MAX
+
+
 def _is_observed(channel: BagChannel) -> bool:
-    return channel.kind == "messages" and (
-        channel.name == LOSSES or channel.name.startswith((f"{STATISTICS}/", f"{BUS_LOADS}/"))
+    return (
+        channel.kind == "messages"
+        and len(channel.name) <= _NAME_MAX
+        and (channel.name == LOSSES or channel.name.startswith((f"{STATISTICS}/", f"{BUS_LOADS}/")))
     )
 
 
 def _described_nodes(bag: Bag) -> dict[Node, _DescribedNode]:
     """Return the nodes of the description of the network that the recorder has attached; none if there is none."""
-    if not any(
-        each.name == NETWORK and each.data_size <= _ATTACHMENT_MAX
-        for file in bag.files
-        for each in file.summary.attachments
-    ):
-        return {}
-    for attachment in bag.attachments():
-        if attachment.name == NETWORK and len(attachment.data) <= _ATTACHMENT_MAX:
-            try:
-                network = msgspec.json.decode(attachment.data, type=_DescribedNetwork)
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-                return {}
-            return {(each.module, each.node): each for each in network.nodes}
+    for attachment in itertools.chain.from_iterable(file.attachments(NETWORK, _ATTACHMENT_MAX) for file in bag.files):
+        try:
+            network = msgspec.json.decode(attachment.data, type=_DescribedNetwork)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            continue
+        return {(each.module, each.node): each for each in network.nodes[:_ENTRIES_MAX]}
     return {}
 
 
@@ -207,7 +220,7 @@ class _Instant:
     def observe(self, channel: BagChannel, time: int, data: bytes) -> None:
         """Enter a message of a recorder; those that come later are earlier."""
         name = channel.name
-        if time > self._time or name in self._complete:
+        if time > self._time or name in self._complete or len(data) > _STATISTICS_MAX:
             return
         try:
             if name.startswith(f"{STATISTICS}/"):
@@ -224,6 +237,8 @@ class _Instant:
 
     def _answered(self, module: str, time: int, statistics: ModuleStatistics) -> None:
         later = self._answers.get(module)
+        if later is None and len(self._answers) >= _MODULES_MAX:
+            return
         if later is None:
             self._answers[module] = _Answers(time, statistics)
         elif time < later.time:
@@ -232,7 +247,10 @@ class _Instant:
 
     def snapshot(self) -> NetworkSnapshot:
         """Return the figures of all that was entered."""
-        self._counters = {name: each.counters(name) for name, each in sorted(self._answers.items())}
+        room = _ENTRIES_MAX
+        for name, answers in sorted(self._answers.items()):
+            counters = self._counters[name] = answers.counters(name, room)
+            room -= counters.entries
         return NetworkSnapshot(
             time=self._time,
             network=", ".join(each.file.path.name for each in self._static.bag.files[:1]),
@@ -241,6 +259,7 @@ class _Instant:
             services=list(self._services()),
             links=list(self._links()),
             buses=list(self._buses()),
+            topics_left_out=self._static.left_out,
         )
 
     # Topics
@@ -250,7 +269,7 @@ class _Instant:
         names = {*self._static.channels, *publishers, *subscribers}
         lost_on_way, laxity = self._on_links()
         lost = {each.topic: each for each in self._lost.topics} if self._lost is not None else {}
-        for name in sorted(names):
+        for name in sorted(names)[:_TOPICS_MAX]:
             known = self._static.publishers(name)
             known |= publishers.get(name, {})
             size, varies = self._scan.sizes.get(name, (None, False))

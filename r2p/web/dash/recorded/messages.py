@@ -13,7 +13,7 @@ from r2p.recording.mcap_reader import MessageRecord
 from r2p.web.dash.recorded.plots import wanted_channels
 from r2p.web.dash.recorded.reader import ChunkTable, RecordingReader
 
-_CHUNKS_MAX: Final = 10_000  # that are looked into for one message: only those that have the topic
+_CHUNKS_MAX: Final = 4000  # that are looked into for one message; most files say which ones have the topic
 _HEX_MAX: Final = 256  # bytes that are shown of a message of unknown type
 
 

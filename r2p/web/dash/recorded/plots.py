@@ -228,7 +228,7 @@ class MinMaxSteps:
             first, last, before, after = self._steps[number]
             times.append(first / SECOND)
             values.append(before)
-            if last > first:
+            if last > first or after != before:
                 times.append(last / SECOND)
                 values.append(after)
         return times, list(zip(*values, strict=True))

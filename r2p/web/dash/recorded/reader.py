@@ -118,9 +118,11 @@ class ChunkCache:
             return known[0]  # type: ignore[return-value]
         found, size = read()
         size += _OF_RECORD
+        if size > self._limit // 2:
+            return found
         self._kept[key] = found, size
         self._bytes += size
-        while self._bytes > self._limit and len(self._kept) > 1:
+        while self._bytes > self._limit:
             _, (_, freed) = self._kept.popitem(last=False)
             self._bytes -= freed
         return found

@@ -12,8 +12,11 @@ from collections.abc import Callable, Hashable
 from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
+import msgspec
+
 from r2p.errors import DecodeError
 from r2p.messages import Message, layout
+from r2p.monitoring.counters import clamp
 from r2p.recording.bag import Bag
 from r2p.recording.channels import BagChannel
 from r2p.recording.mcap_reader import ChunkRef, MessageRecord
@@ -185,9 +188,9 @@ class RecordingScan:
                 topic = each.about.partition(" of ")[0]
                 counts[topic, each.kind, min(max((each.time - self.start) // self.step, 0), STEPS)] += each.count
         for (topic, kind, step), count in counts.items():
-            self.keep(self.misses, (topic, kind, step, count), MISSES_MAX, "misses")
+            self.keep(self.misses, (topic, kind, step, clamp(count)), MISSES_MAX, "misses")
         for each in collapsed(sorted(found, key=lambda each: each.time)):
-            self.keep(self.events, each, EVENTS_MAX, "events")
+            self.keep(self.events, msgspec.structs.replace(each, count=clamp(each.count)), EVENTS_MAX, "events")
 
     def keep(self, kept: list[V], item: V, limit: int, name: str) -> None:
         """Append to a list that has a limit."""

@@ -48,9 +48,10 @@ class RecordedSession(SourceSession):
         self._source = source
         self._client = client
         self._cursor: Cursor | None = None
-        self._due = asyncio.Event()  # figures are to be sent
+        self._due = asyncio.Event()  # figures have to be sent
         self._due.set()
         self._moved = asyncio.Event()  # the cursor stands, and is at another instant, or something else is to be shown
+        self._stale = asyncio.Event()  # so do messages and the log
         self._tasks: set[asyncio.Task[None]] = set()
         self._plots: dict[int, asyncio.Task[None] | None] = {}
         """The plots by stream; None while it is being looked up."""
@@ -103,6 +104,7 @@ class RecordedSession(SourceSession):
             self._cursor = Cursor(bag.start, bag.end)
             self._moved.set()
             self._begin(self._follow_cursor(self._cursor))
+            self._begin(self._follow_topics(self._cursor))
             self._begin(self._follow_scan())
         return self._cursor
 
@@ -132,7 +134,7 @@ class RecordedSession(SourceSession):
         self._moved.set()
 
     async def _follow_cursor(self, cursor: Cursor) -> None:
-        """Send what is to be seen at the cursor, after each move, and while it runs."""
+        """Send where the cursor is, after each move, and while it runs; and have the rest sent."""
         tick = 0
         while True:
             if cursor.playing:
@@ -144,10 +146,17 @@ class RecordedSession(SourceSession):
             tick += 1
             if not cursor.playing or tick % _STATES == 0:
                 self._due.set()
+            self._send({"op": "clock", "time": cursor.time, "playing": cursor.playing, "rate": cursor.rate}, "clock")
+            self._stale.set()
+
+    async def _follow_topics(self, cursor: Cursor) -> None:
+        """Send messages and the log as they are at the cursor; what takes long to find comes later."""
+        while True:
+            await self._stale.wait()
+            self._stale.clear()
             time = cursor.time
-            self._send({"op": "clock", "time": time, "playing": cursor.playing, "rate": cursor.rate}, "clock")
             for topic, watched in list(self._watched.items()):
-                if (news := await watched.news(time)) is not None:
+                if (news := await watched.news(time)) is not None and topic in self._watched:
                     self._send(news, f"message {topic}")
             await self._send_log(time)
 
@@ -171,7 +180,6 @@ class RecordedSession(SourceSession):
             "step": max((bag.end - bag.start) // STEPS, 1),
             "files": [each.file.path.name for each in bag.files],
             "problems": bag.problems,
-            "topics": bag.topics,
         }
 
     async def _send_timeline(self) -> None:
@@ -271,7 +279,7 @@ class RecordedSession(SourceSession):
         is_new = before is None or before > time
         records = await self._source.log.before(time, level, -1 if is_new or before is None else before)
         if self._level != level or self._logged != before:  # the page has asked for another part meanwhile
-            self._moved.set()
+            self._stale.set()
             return
         self._logged = time
         is_cleared = is_new or len(records) >= RECORDS_MAX
