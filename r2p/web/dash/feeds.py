@@ -91,7 +91,7 @@ class TopicFeeds:
     async def find_type(self, topic: str, name: str = "") -> type[Message]:
         """Return the type of a topic, or the one of this `name`. Raises WebError if it is unknown."""
         if name:
-            found = standard_classes().get(name)
+            found = next((cls for full, cls in standard_classes().items() if name in (full, cls.__name__)), None)
             if found is None:
                 raise WebError(f"r2p has no type {name[:100]!r}: leave it out, and the topic's own one is taken")
             return found

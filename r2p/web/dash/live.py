@@ -14,6 +14,7 @@ from r2p.monitoring.log import LogFollower
 from r2p.monitoring.monitor import NetworkMonitor
 from r2p.monitoring.snapshot import NetworkSnapshot
 from r2p.monitoring.topic_types import TypeFinder
+from r2p.ros.classes import standard_classes
 from r2p.version import __version__
 from r2p.web.client import WebClient
 from r2p.web.dash import orders, protocol
@@ -199,7 +200,9 @@ class LiveSession(SourceSession):
         if request.service:
             found = await service_types(self._source.feeds, request.service)
             return {name: describe(cls) for name, cls in zip(("request", "response"), found, strict=True)}
-        return describe(await self._source.feeds.find_type(request.topic))
+        if not request.topic and not request.type:
+            return {"types": sorted(standard_classes())}
+        return describe(await self._source.feeds.find_type(request.topic, request.type))
 
     async def _call(self, request: protocol.CallService) -> object:
         return await call_service(self._source.feeds, request)

@@ -91,7 +91,8 @@ class FollowLog(_Request, tag="log"):
 class Describe(_Request, tag="describe"):
     """Answer with a type: {"type": ..., "fields": [{"path", "kind", ...}, ...], "zero": {...}}.
 
-    Of a topic; or of a service's request and response: {"request": {...}, "response": {...}}.
+    Of a topic, or of the standard `type` that it is to have; or of a service's request and response: {"request": {...},
+    "response": {...}}. Without any of these the answer has the names of the standard types: {"types": [...]}.
 
     Fields are in their order, and flat: "pose", "pose.x". Parts of each element of an array have [] in their path:
     "points[].x". `kind` is a number's ("u8" to "u64", "i8" to "i64", "f32", "f64"), "bool", "text", or "message", whose
@@ -102,6 +103,7 @@ class Describe(_Request, tag="describe"):
 
     topic: str = ""
     service: str = ""
+    type: str = ""
 
 
 class Publish(_Request, tag="publish"):

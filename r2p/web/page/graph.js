@@ -11,7 +11,7 @@ export const graph = {
   id: "graph",
   title: "Graph",
   keys: [
-    ["← → ↑ ↓", "to the neighbours of a box, and in its layer"],
+    ["← → ↑ ↓", "to the neighbours of a box, and beside it"],
     ["Enter", "what a box is"],
     ["+ -", "zoom"],
     ["f", "fit all of it"],

@@ -2,7 +2,7 @@
 
 import { setText } from "./dom.js"
 import { fixed } from "./format.js"
-import { edgeKey, layout } from "./graph_layout.js"
+import { arrange, edgeKey } from "./graph_layout.js"
 import { short } from "./graph_model.js"
 import { PanZoom } from "./pan_zoom.js"
 
@@ -13,6 +13,7 @@ const HEIGHT = 30 // px of a box
 const PADDING = 24 // px around the graph
 const SCALE_MAX = 4
 const SCALE_FIT = 1.1 // a small graph is not blown up beyond this
+const BETTER = 1.15 // times as large another arrangement has to be, before a drawn graph is arranged anew
 
 function s(tag, properties = {}, ...children) {
   const element = document.createElementNS(SVG, tag)
@@ -29,6 +30,9 @@ export class GraphDrawing {
   #places = new Map()
   #around = new Map()
   #size = { width: 1, height: 1 }
+  #graph = null
+  #updated = null
+  #way = ""
   #view = { x: 0, y: 0, scale: 1 }
   #selected = null
   #focused = null
@@ -46,15 +50,40 @@ export class GraphDrawing {
     })
     this.element.addEventListener("click", event => this.#click(event))
     this.element.addEventListener("keydown", event => this.#key(event))
-    new ResizeObserver(() => this.#fitted && this.fit()).observe(this.element)
+    new ResizeObserver(() => this.#resized()).observe(this.element)
   }
 
-  // Draw another graph. The places of its parts depend on nothing but these.
-  draw({ elements, edges }) {
+  // Draw another graph. The places of its parts depend on nothing but these, and on the direction that fits better.
+  draw(graph) {
+    this.#graph = graph
+    const laid = this.#arrange(graph)
+    this.#way = laid.way
+    this.#place(graph, laid)
+  }
+
+  // Arrange the graph for the area; as long as the shape of that stays, so do all places.
+  #arrange({ elements, edges }) {
     const boxes = [...elements.values()].map(({ id, label }) => ({
       id, height: HEIGHT, width: Math.round(short(label, LETTERS).length * LETTER) + 26,
     }))
-    const { places, routes, width, height } = layout(boxes, [...edges.values()])
+    return arrange(boxes, [...edges.values()], this.#area())
+  }
+
+  #resized() {
+    if (!this.#graph || !this.#fitted) return
+    const laid = this.#arrange(this.#graph)
+    if (laid.way !== this.#way || this.#scaleFor(laid) > BETTER * this.#scaleFor(this.#size)) this.#redraw()
+    else this.fit()
+  }
+
+  // Draw the same graph again, arranged for another area.
+  #redraw() {
+    const [graph, troubles] = this.#updated ?? [this.#graph, new Map()]
+    this.draw(graph)
+    this.update(graph, troubles)
+  }
+
+  #place({ elements, edges }, { places, routes, width, height }) {
     this.#places = places
     this.#size = { width, height }
     this.#around = new Map([...elements.keys()].map(id => [id, []]))
@@ -69,7 +98,9 @@ export class GraphDrawing {
   }
 
   // Show newer figures of the same parts. `troubles` has texts of edges that need action, by key.
-  update({ elements, edges }, troubles) {
+  update(graph, troubles) {
+    const { elements, edges } = graph
+    this.#updated = [graph, troubles]
     for (const [key, edge] of edges) this.#updateEdge(this.#edges.get(key), edge, troubles.get(key))
     for (const [id, element] of elements) this.#updateBox(this.#boxes.get(id), element)
   }
@@ -93,10 +124,15 @@ export class GraphDrawing {
   fit() {
     const { width, height } = this.#area()
     const { width: w, height: h } = this.#size
-    const scale = Math.min(SCALE_FIT, width / (w + 2 * PADDING), height / (h + 2 * PADDING))
+    const scale = this.#scaleFor(this.#size)
     this.#view = { scale, x: (width - w * scale) / 2, y: (height - h * scale) / 2 }
     this.#fitted = true
     this.#show()
+  }
+
+  #scaleFor(size) {
+    const { width, height } = this.#area()
+    return Math.min(SCALE_FIT, width / (size.width + 2 * PADDING), height / (size.height + 2 * PADDING))
   }
 
   zoomBy(factor) {
@@ -157,7 +193,7 @@ export class GraphDrawing {
   #edge(edge, points) {
     this.#around.get(edge.from).push(edge.to)
     this.#around.get(edge.to).push(edge.from)
-    const path = s("path", { d: curve(points) })
+    const path = s("path", { d: curve(points, this.#way) })
     const middle = points.length > 2 ? points[points.length / 2 | 0] : halfway(...points)
     const label = s("text", { x: middle.x, y: middle.y - 4, "text-anchor": "middle" })
     const element = s("g", { class: `edge ${edge.role}` }, path, label)
@@ -190,12 +226,16 @@ export class GraphDrawing {
   #step(key) {
     const here = this.#places.get(this.#focused)
     if (!here) return
-    const side = { ArrowLeft: -1, ArrowRight: 1 }[key] ?? 0
-    const way = { ArrowUp: -1, ArrowDown: 1 }[key] ?? 0
+    const [before, after, up, down] = this.#way === "right"
+      ? ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"]
+      : ["ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight"]
+    const side = { [before]: -1, [after]: 1 }[key] ?? 0
+    const step = { [up]: -1, [down]: 1 }[key] ?? 0
+    const across = place => this.#way === "right" ? place.y - here.y : place.x - here.x
     const near = side ? this.#around.get(this.#focused) : [...this.#places.keys()]
     const fits = place => side
       ? Math.sign(place.layer - here.layer) === side
-      : place.layer === here.layer && Math.sign(place.y - here.y) === way
+      : place.layer === here.layer && Math.sign(across(place)) === step
     const distance = place => Math.hypot(place.x - here.x, place.y - here.y)
     const next = near.filter(id => fits(this.#places.get(id)))
       .sort((one, other) => distance(this.#places.get(one)) - distance(this.#places.get(other)))[0]
@@ -234,13 +274,13 @@ function arrow(id) {
 }
 
 // Return a path through points: curves between layers, straight lines through them.
-function curve(points) {
-  return points.map((point, index) => {
-    const { x, y } = point
+function curve(points, way) {
+  return points.map(({ x, y }, index) => {
     if (!index) return `M ${x} ${y}`
-    const before = points[index - 1]
-    const bend = (x - before.x) / 2
-    return index % 2 ? `C ${before.x + bend} ${before.y} ${x - bend} ${y} ${x} ${y}` : `L ${x} ${y}`
+    if (index % 2 === 0) return `L ${x} ${y}`
+    const { x: fromX, y: fromY } = points[index - 1]
+    const [dx, dy] = way === "right" ? [(x - fromX) / 2, 0] : [0, (y - fromY) / 2]
+    return `C ${fromX + dx} ${fromY + dy} ${x - dx} ${y - dy} ${x} ${y}`
   }).join(" ")
 }
 

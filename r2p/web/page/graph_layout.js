@@ -1,27 +1,109 @@
-// The places of nodes and topics in the graph: layers from left to right, as the messages go.
+// The places of nodes and topics in the graph: layers from left to right, or from top to bottom, as the messages go.
 //
 // The same graph always has the same places, whatever the order in which its parts are given: rates and counters don't
 // take part, so nothing jumps when they change. Edges that close a circle are taken backwards, long ones go through
 // points in the layers between, and sweeps over the layers bring neighbours to the same height.
 
-export const LAYER_GAP = 96 // px
-const ROW_GAP = 14 // px
+const LAYER_GAP = { right: 92, down: 56 } // px: room for the text of an edge
+const ROW_GAP = { right: 14, down: 22 } // px
+const PART_GAP = 44 // px between parts that are not connected
+const ROWS_MAX = 40 // arrangements that are tried for each direction
 const BEND_HEIGHT = 10 // px that an edge takes in a layer that it crosses
 const SWEEPS = 8
 const SETTLES = 12
 
-// Return {places: Map of id to {x, y, width, height, layer}, routes: Map of edge key to points, width, height}.
-// `nodes` are {id, width, height}, `edges` {from, to}; the key of an edge is edgeKey(edge).
-export function layout(nodes, edges) {
+// Return {places: Map of id to {x, y, width, height, layer}, routes: Map of edge key to points, width, height, way}.
+// `nodes` are {id, width, height}, `edges` {from, to}; the key of an edge is edgeKey(edge). `way` is "right" or "down":
+// parts that are not connected are arranged so that all of it is as large as it can be in an `area` {width, height}.
+export function arrange(nodes, edges, area) {
+  const kept = withoutDangling(nodes, edges)
+  const components = componentsOf(nodes, kept)
+  const candidates = ["right", "down"].flatMap(way => {
+    const parts = components.map(part => layout(part.nodes, part.edges, way))
+    let sum = 0
+    const widths = parts.map(part => (sum += part.width + PART_GAP))
+    return [...new Set([...widths.slice(0, ROWS_MAX), widths.at(-1)])].map(width => ({ way, ...pack(parts, width) }))
+  })
+  const scale = ({ width, height }) => Math.min(area.width / Math.max(1, width), area.height / Math.max(1, height))
+  return candidates.reduce((best, each) => (scale(each) > scale(best) * 1.001 ? each : best))
+}
+
+function withoutDangling(nodes, edges) {
+  const known = new Set(nodes.map(node => node.id))
+  return unique(edges.filter(edge => edge.from !== edge.to && known.has(edge.from) && known.has(edge.to)))
+}
+
+// Return the connected parts of a graph, the largest first.
+function componentsOf(nodes, edges) {
+  const near = new Map(nodes.map(node => [node.id, []]))
+  for (const { from, to } of edges) {
+    near.get(from).push(to)
+    near.get(to).push(from)
+  }
+  const partOf = new Map()
   const sorted = [...nodes].sort((one, other) => compare(one.id, other.id))
-  const known = new Set(sorted.map(node => node.id))
-  const kept = unique(edges.filter(edge => edge.from !== edge.to && known.has(edge.from) && known.has(edge.to)))
+  for (const { id } of sorted) {
+    const reached = partOf.has(id) ? [] : [id]
+    for (const each of reached) {
+      if (partOf.has(each)) continue
+      partOf.set(each, id)
+      reached.push(...near.get(each))
+    }
+  }
+  const parts = new Map()
+  for (const node of sorted) {
+    const first = partOf.get(node.id)
+    if (!parts.has(first)) parts.set(first, { first, nodes: [], edges: [] })
+    parts.get(first).nodes.push(node)
+  }
+  for (const edge of edges) parts.get(partOf.get(edge.from)).edges.push(edge)
+  const size = part => part.nodes.length
+  return [...parts.values()].sort((one, other) => size(other) - size(one) || compare(one.first, other.first))
+}
+
+// Put parts beside each other, in rows of at most a width.
+function pack(parts, width) {
+  const packed = { places: new Map(), routes: new Map(), width: 0, height: 0 }
+  let [x, y, rowHeight] = [0, 0, 0]
+  for (const part of parts) {
+    if (x && x + part.width > width) [x, y, rowHeight] = [0, y + rowHeight + PART_GAP, 0]
+    shift(part, x, y, packed)
+    rowHeight = Math.max(rowHeight, part.height)
+    packed.width = Math.max(packed.width, x + part.width)
+    packed.height = Math.max(packed.height, y + part.height)
+    x += part.width + PART_GAP
+  }
+  return packed
+}
+
+function shift({ places, routes }, dx, dy, { places: allPlaces, routes: allRoutes }) {
+  for (const [id, place] of places) allPlaces.set(id, { ...place, x: place.x + dx, y: place.y + dy })
+  for (const [key, points] of routes) allRoutes.set(key, points.map(({ x, y }) => ({ x: x + dx, y: y + dy })))
+}
+
+// Lay out connected nodes in one direction; returns what `arrange` does.
+export function layout(nodes, edges, way = "right") {
+  if (way === "right") return layoutRight(nodes, edges, way)
+  const turned = layoutRight(nodes.map(node => ({ ...node, width: node.height, height: node.width })), edges, way)
+  const turn = ({ x, y, width, height, ...rest }) => ({ ...rest, x: y, y: x, width: height, height: width })
+  const point = ({ x, y }) => ({ x: y, y: x })
+  return {
+    places: new Map([...turned.places].map(([id, place]) => [id, turn(place)])),
+    routes: new Map([...turned.routes].map(([key, points]) => [key, points.map(point)])),
+    width: turned.height,
+    height: turned.width,
+  }
+}
+
+function layoutRight(nodes, edges, way) {
+  const sorted = [...nodes].sort((one, other) => compare(one.id, other.id))
+  const kept = withoutDangling(sorted, edges)
   const forward = withoutCircles(sorted, kept)
   const layerOf = layers(sorted, forward)
   const graph = withBends(sorted, forward, layerOf)
   order(graph)
-  settle(graph)
-  return measure(graph, kept, forward)
+  settle(graph, ROW_GAP[way])
+  return measure(graph, kept, forward, LAYER_GAP[way])
 }
 
 export const edgeKey = edge => `${edge.from}\n${edge.to}`
@@ -169,31 +251,31 @@ function inversions(values) {
 }
 
 // Move the items of each layer towards the height of their neighbours, in their order and with gaps between them.
-function settle({ rows }) {
+function settle({ rows }, rowGap) {
   for (const row of rows) {
     let y = 0
     for (const item of row) {
       item.y = y + item.height / 2
-      y += item.height + ROW_GAP
+      y += item.height + rowGap
     }
   }
   for (let round = 0; round < SETTLES; round++) {
     for (const row of round % 2 ? [...rows].reverse() : rows) {
       const sides = round % 2 ? item => item.after : item => item.before
       align(row, row.map(item => mean(round === SETTLES - 1 ? [...item.before, ...item.after] : sides(item),
-        each => each.y, item.y)))
+        each => each.y, item.y)), rowGap)
     }
   }
 }
 
 // Give items the nearest heights to those wanted: blocks of items that touch share the mean of what they want.
-function align(row, wanted) {
+function align(row, wanted, rowGap) {
   const blocks = []
   row.forEach((item, index) => {
     let block = { items: [item], offset: [0], sum: wanted[index], height: 0 }
     while (blocks.length) {
       const last = blocks[blocks.length - 1]
-      const gap = (last.items.at(-1).height + block.items[0].height) / 2 + ROW_GAP
+      const gap = (last.items.at(-1).height + block.items[0].height) / 2 + rowGap
       if (last.sum / last.items.length + last.height + gap <= block.sum / block.items.length) break
       blocks.pop()
       block = joined(last, block, last.height + gap)
@@ -214,9 +296,9 @@ function joined(first, second, shift) {
   }
 }
 
-function measure({ rows, items, chains }, edges, forward) {
+function measure({ rows, items, chains }, edges, forward, layerGap) {
   const widths = rows.map(row => Math.max(0, ...row.map(item => item.width)))
-  const lefts = widths.map((_, index) => widths.slice(0, index).reduce((sum, width) => sum + width + LAYER_GAP, 0))
+  const lefts = widths.map((_, index) => widths.slice(0, index).reduce((sum, width) => sum + width + layerGap, 0))
   const all = rows.flat()
   const top = Math.min(0, ...all.map(item => item.y - item.height / 2))
   const x = item => lefts[item.layer] + widths[item.layer] / 2

@@ -36,7 +36,19 @@ export function graphOf(store, { all = false, byModule = false, words = [], limi
   for (const topic of store.topics.values()) {
     if (all || !isInfrastructure(topic)) addTopic(graph, topic, byModule, own)
   }
+  if (!all) dropHelpers(graph, store, byModule)
   return cut(filtered(graph, words), limit)
+}
+
+// Leave out nodes that have topics, but none that is shown: those of logs and reports.
+function dropHelpers(graph, store, byModule) {
+  const connected = new Set([...graph.edges.values()].flatMap(({ from, to }) => [from, to]))
+  for (const { publishers = [], subscribers = [] } of store.topics.values()) {
+    for (const { module, node } of [...publishers, ...subscribers]) {
+      const id = nodeId(node && !byModule ? `${module}/${node}` : module ?? "")
+      if (!connected.has(id) && !byModule) graph.elements.delete(id)
+    }
+  }
 }
 
 export function isInfrastructure(topic) {

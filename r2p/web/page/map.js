@@ -276,15 +276,22 @@ class MapView {
       pen.lineTo(...to)
       pen.stroke()
     }
+    const write = (text, x, y) => {
+      pen.lineWidth = 4
+      pen.strokeStyle = color("--back")
+      pen.strokeText(text, x, y)
+      pen.fillText(text, x, y)
+      pen.lineWidth = 1
+    }
     for (const n of lines(this.#view.x - half.x, this.#view.x + half.x, step)) {
       const [x] = place({ x: n * step, y: 0 })
       line([Math.round(x) + 0.5, 0], [Math.round(x) + 0.5, height], n === 0)
-      pen.fillText(lengthText(n * step, step), x + 4, height - 6)
+      if (x < width - 60) write(lengthText(n * step, step), x + 4, height - 6)
     }
     for (const n of lines(this.#view.y - half.y, this.#view.y + half.y, step)) {
       const [, y] = place({ x: 0, y: n * step })
       line([0, Math.round(y) + 0.5], [width, Math.round(y) + 0.5], n === 0)
-      if (y < height - 24) pen.fillText(lengthText(n * step, step), 4, y - 4)
+      if (y < height - 24) write(lengthText(n * step, step), 4, y - 4)
     }
     this.#paintScale(pen, width, step)
   }

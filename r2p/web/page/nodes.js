@@ -14,7 +14,8 @@ const MODULE_ORDERS = {
   },
   stop: {
     text: "Stop", danger: true,
-    ask: name => `Stop all nodes of ${name}? What they drive is then not controlled.`, done: name => `${name} is stopped`,
+    ask: name => `Stop all nodes of ${name}? What they drive is then not controlled.`,
+    done: name => `${name} is stopped`,
   },
   reboot: {
     text: "Reboot", danger: true,
@@ -116,7 +117,8 @@ class ModulePanel {
   constructor(app, name) {
     this.#app = app
     const heads = [
-      ["Node"], ["State"], ["Restarts", "number"], ["Publishes", "level-3"], ["Subscribes to", "level-3"], ["Orders"],
+      ["Node"], ["State"], ["Restarts", "number level-2"], ["Publishes", "level-2"], ["Subscribes to", "level-2"],
+      ["Orders"],
     ]
     this.#table = h("div", { class: "table-box" }, h("table", { class: "plain nodes-table" },
       h("caption", { class: "sr-only" }, `Nodes of ${name}`),
@@ -130,7 +132,8 @@ class ModulePanel {
 
   update(module, { control }) {
     if (module === this.#module && control === this.#control) return
-    const changedOrders = control !== this.#control || module.kind !== this.#module?.kind
+    const before = this.#module
+    const changedOrders = control !== this.#control || module.kind !== before?.kind || module.state !== before.state
     this.#module = module
     this.#control = control
     setText(this.#state, module.state)
@@ -142,9 +145,10 @@ class ModulePanel {
     setText(this.#none, why || (module.nodes?.length ? "" : "Its nodes are not known."))
   }
 
-  #drawOrders({ name, kind, link }) {
+  #drawOrders({ name, kind, link, state }) {
     const possible = link && kind !== "ROS" && !this.#app.hello?.recording
-    this.#orders.replaceChildren(...(possible ? Object.keys(MODULE_ORDERS) : []).map(order => (
+    const orders = state === "running" ? ["stop", "reboot"] : ["start", "reboot"]
+    this.#orders.replaceChildren(...(possible ? orders : []).map(order => (
       this.#button(MODULE_ORDERS[order], name, () => this.#app.connection.request("module", { module: name, order })))))
   }
 
@@ -161,7 +165,7 @@ class ModulePanel {
 
   #row({ name }) {
     const full = `${this.#module.name}/${name}`
-    const [state, restarts, publishes, subscribes] = ["", "number", "level-3 names", "level-3 names"]
+    const [state, restarts, publishes, subscribes] = ["", "number level-2", "level-2 names", "level-2 names"]
       .map(kind => h("td", { class: kind }))
     const orders = h("td", { class: "orders" })
     if (this.#module.link && this.#module.kind === "r2p" && !this.#app.hello?.recording) {
@@ -178,7 +182,9 @@ class ModulePanel {
       restarts.dataset.tone = node.restarts ? "warn" : ""
       setText(publishes, node.publishes?.join(", ") ?? "")
       setText(subscribes, node.subscribes?.join(", ") ?? "")
+      const possible = ordersOf(node, this.#module)
       for (const each of orders.querySelectorAll("button")) {
+        each.hidden = !possible.includes(each.dataset.order)
         each.disabled = !this.#control
         each.title = this.#control ? "" : "Start r2p dash with --allow-control"
       }
@@ -192,11 +198,18 @@ class ModulePanel {
       await attempt(send(), done(name))
       element.disabled = !this.#control
     }, {
-      class: kind, "aria-label": `${text} ${name}`, disabled: !this.#control,
+      class: kind, "aria-label": `${text} ${name}`, disabled: !this.#control, dataset: { order: text.toLowerCase() },
       title: this.#control ? null : "Start r2p dash with --allow-control",
     })
     return element
   }
+}
+
+// A node of which its module says nothing, while it answers, is a part of r2p and takes no orders: that of its log.
+function ordersOf({ running }, { answers }) {
+  if (running === true) return ["stop", "restart"]
+  if (running === false) return ["start"]
+  return answers === true ? [] : Object.keys(NODE_ORDERS)
 }
 
 function stateText({ running }) {

@@ -20,6 +20,7 @@ class PublishView {
   #app
   #form = null
   #topic = ""
+  #typeName = ""
   #forms = new Map() // by topic: what was written there stays
   #running = new Map() // by topic: {rate, sent}
   #hint = h("p", { class: "hint", hidden: true },
@@ -29,7 +30,10 @@ class PublishView {
     type: "text", list: "publish-topics", autocomplete: "off", spellcheck: "false", placeholder: "Topic",
     "aria-keyshortcuts": "/", dataset: { filter: "" },
   })
-  #type = h("input", { type: "text", autocomplete: "off", spellcheck: "false", placeholder: "as the topic has it" })
+  #types = h("datalist", { id: "publish-types" })
+  #type = h("input", {
+    type: "text", list: "publish-types", autocomplete: "off", spellcheck: "false", placeholder: "that of the topic",
+  })
   #rate = h("input", { type: "text", inputmode: "decimal", class: "rate", value: String(RATE) })
   #about = h("p", { class: "dim", role: "status" })
   #error = h("p", { class: "error", role: "alert" })
@@ -47,7 +51,8 @@ class PublishView {
     this.#app = app
     this.element = h("section", { class: "view publish-view" },
       h("div", { class: "bar" }, h("h2", {}, "Publish"), field("Topic", this.#name, { hidden: true }), this.#names,
-        field("Type", this.#type), button("Open", () => this.#choose(this.#name.value, this.#type.value))),
+        field("Type", this.#type), this.#types,
+        button("Open", () => this.#choose(this.#name.value, this.#type.value))),
       this.#hint, this.#about, this.#list,
       h("form", { novalidate: true, autocomplete: "off", onsubmit: event => {
         event.preventDefault()
@@ -63,12 +68,18 @@ class PublishView {
   show(argument) {
     this.#app.store.addEventListener("change", this.#update)
     this.#allow()
-    if (argument) this.#choose(argument, "")
+    if (!this.#types.children.length) this.#findTypes().catch(() => {}) // a convenience: types can be written, too
+    if (argument && argument !== this.#topic) this.#choose(argument, "")
     this.#describeTopic()
   }
 
   hide() {
     this.#app.store.removeEventListener("change", this.#update)
+  }
+
+  async #findTypes() {
+    const { types } = await this.#app.connection.request("describe")
+    this.#types.replaceChildren(...types.map(name => h("option", { value: name })))
   }
 
   #begin() {
@@ -88,12 +99,13 @@ class PublishView {
 
   #changed() {
     const name = this.#name.value.trim()
-    if (name && name !== this.#topic) this.#choose(name, this.#type.value.trim())
+    const type = this.#type.value.trim()
+    if (name && (name !== this.#topic || type !== this.#typeName)) this.#choose(name, type)
   }
 
   async #choose(name, type) {
     this.#topic = this.#name.value = name.trim()
-    this.#type.value = type.trim()
+    this.#type.value = this.#typeName = type.trim()
     this.#app.rename("publish", this.#topic)
     setText(this.#error, "")
     this.#show(null)
@@ -112,7 +124,7 @@ class PublishView {
   async #formOf(topic, type) {
     const key = `${topic} ${type}`
     if (!this.#forms.has(key)) {
-      const description = await this.#app.connection.request("describe", type ? { topic, type } : { topic })
+      const description = await this.#app.connection.request("describe", { topic, type })
       this.#forms.set(key, { form: new MessageForm(description), type: description.type })
     }
     return this.#forms.get(key)
@@ -132,8 +144,8 @@ class PublishView {
       this.#names.replaceChildren(...names.map(name => h("option", { value: name })))
     }
     const topic = this.#app.store.topics.get(this.#topic)
-    if (!this.#topic) return setText(this.#about, "Choose a topic: the form follows from its type.")
-    if (!topic) return setText(this.#about, `${this.#topic} is not known on the network: nothing subscribes to it yet.`)
+    if (!this.#topic) return setText(this.#about, "Choose a topic: its type makes the form.")
+    if (!topic) return setText(this.#about, `${this.#topic} is not on the network yet: choose the type that it is to have.`)
     const others = topic.publishers?.filter(each => each.module).map(each => each.module) ?? []
     const by = others.length ? ` · also published by ${[...new Set(others)].join(", ")}` : ""
     const known = topic.subscribers?.length ? plural(topic.subscribers.length, "subscriber") : "no subscriber is known"

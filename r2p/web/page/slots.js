@@ -73,14 +73,17 @@ function stateOf(slot, owner) {
 export function rowsOf(bus) {
   const rows = new Map()
   for (const each of bus.topics ?? []) {
-    const key = `${each.module} ${each.topic || each.kind}`
+    const isOfUsers = !["sync", "management"].includes(each.kind)
+    const topic = isOfUsers ? each.topic : ""
+    const key = `${each.module} ${topic || each.kind}`
     const kind = KIND_NAMES[each.kind] ?? each.kind
-    rows.set(key, { key, kind, topic: each.topic, module: each.module, share: each.share, frames: each.frames })
+    rows.set(key, { key, kind, topic, module: each.module, share: each.share, frames: each.frames })
   }
   for (const { topic, module, slots: owned } of bus.slots ?? []) {
-    if (!topic || !owned?.length || owned[0] === 0) continue
-    const key = `${module} ${topic}`
-    const row = rows.get(key) ?? { key, kind: KIND_NAMES.hrt, topic, module }
+    if (!topic || !owned?.length) continue
+    const isSync = owned[0] === 0
+    const key = `${module} ${isSync ? "sync" : topic}`
+    const row = rows.get(key) ?? { key, kind: KIND_NAMES[isSync ? "sync" : "hrt"], topic: isSync ? "" : topic, module }
     rows.set(key, { ...row, slots: owned, reserved: bus.slots_in_cycle ? owned.length / bus.slots_in_cycle : null })
   }
   return [...rows.values()]
@@ -98,7 +101,8 @@ class Colours {
 
 const COLUMNS = colours => [
   { id: "topic", title: "Topic", value: row => row.topic || row.kind, draw: (cell, row) => {
-    const swatch = h("span", { class: row.slots ? `swatch owner-${colours.of(ownerOf(row))}` : "swatch none" })
+    const owner = row.topic ? `owner-${colours.of(ownerOf(row))}` : "kind-sync"
+    const swatch = h("span", { class: `swatch ${row.slots ? owner : "none"}` })
     cell.replaceChildren(swatch, row.topic || row.kind)
   } },
   { id: "module", title: "Module", value: row => row.module || null },
