@@ -148,7 +148,7 @@ class GraphView {
     }
     const heads = ["Topic", "Rate Hz", "From", "To", "Misses and losses"]
     const rows = [...lists].sort(([one], [other]) => (one < other ? -1 : 1)).map(([name, list]) => h("tr", {},
-      h("th", { scope: "row" }, button(name, () => this.#select(topicId(name)), { class: "quiet link" })),
+      h("th", { scope: "row" }, h("a", { href: this.#app.address("graph", name) }, name)),
       h("td", { class: "number" }, list.topic.rate === undefined ? UNKNOWN : fixed(list.topic.rate)),
       h("td", { class: "names" }, list.publish.join(", ") || UNKNOWN),
       h("td", { class: "names" }, list.subscribe.join(", ") || UNKNOWN),
@@ -159,7 +159,7 @@ class GraphView {
       h("thead", {}, h("tr", {}, heads.map((head, index) => (
         h("th", { scope: "col", class: index === 1 ? "number" : null }, head))))),
       h("tbody", {}, rows)))
-    if (focused) [...this.#list.querySelectorAll("button")].find(each => each.textContent === focused)?.focus()
+    if (focused) [...this.#list.querySelectorAll("a")].find(each => each.textContent === focused)?.focus()
   }
 
   // Details
@@ -189,8 +189,8 @@ class GraphView {
         h("span", { class: "space" }),
         button("×", () => this.#select(null), { class: "quiet close", "aria-label": "Close details" })),
       h("dl", { class: "facts" }, facts.map(([name, value, tone]) => (
-        [h("dt", {}, name), h("dd", { dataset: { tone: tone ?? "" } }, value)]))),
-      this.#neighbours(lists).flat(), this.#links(element))
+        [h("dt", {}, name), h("dd", { dataset: { tone: tone ?? "" } }, value)])).flat()),
+      ...this.#neighbours(lists).flat(), ...this.#links(element))
     if (focused) [...this.#details.querySelectorAll("button, a")].find(each => each.textContent === focused)?.focus()
   }
 
@@ -223,7 +223,7 @@ class GraphView {
       : [["nodes", "Open the module", element.module], ["parameters", "Parameters", element.module]]
     const links = wanted.filter(([view]) => app.has(view))
       .map(([view, text, argument]) => h("a", { class: "button", href: app.address(view, argument) }, text))
-    return links.length ? h("div", { class: "actions" }, links) : null
+    return links.length ? [h("div", { class: "actions" }, links)] : []
   }
 }
 

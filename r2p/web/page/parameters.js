@@ -238,7 +238,8 @@ class NodeParameters {
     const read = changed.map(row => [row.name, row.read()])
     const wrong = changed.find(row => row.isWrong)
     if (wrong) return wrong.focus()
-    if (read.length) await this.#send(Object.fromEntries(read), `${this.#module.name}/${this.name}: set`)
+    const done = `${plural(read.length, "parameter")} of ${this.#module.name}/${this.name} set`
+    if (read.length) await this.#send(Object.fromEntries(read), done)
   }
 
   async #send(values, done) {
