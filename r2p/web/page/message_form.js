@@ -6,6 +6,7 @@ import {
 } from "./message_fields.js"
 
 const LONG_TEXT = 120 // bytes; a field that takes more gets several lines
+const MANY = 1 << 20 // elements or bytes: a limit of more is one of the network, and says nothing to a user
 
 let ids = 0
 
@@ -127,19 +128,21 @@ function text(node, path, controls) {
     class: node.kind === "text" ? "wide" : isArray(node) ? "wide mono" : "number",
   })
   const { fail, elements } = labelled(node, path, input, controls, hint)
-  input.addEventListener("change", () => fail(""))
+  input.addEventListener("input", () => fail(""))
   return { elements, read: reader(input, fail, parse), write: value => { input.value = show(value) } }
 }
 
 function wayOf(node) {
   if (isArray(node)) {
-    return [value => parseList(node, value), showList, `${node.kind}[${node.length ?? `≤ ${node.max}`}]`]
+    return [value => parseList(node, value), showList, `${node.kind}${countOf(node)}`]
   }
   if (node.kind === "text") return [value => parseText(node, value), value => value ?? "", sizeOf(node)]
   return [value => parseNumber(node.kind, value), value => String(value ?? 0), node.kind]
 }
 
-const sizeOf = node => node.limit === undefined ? "text" : `text ≤ ${node.limit} B`
+const sizeOf = node => node.limit === undefined || node.limit >= MANY ? "text" : `text ≤ ${node.limit} B`
+
+const countOf = node => `[${node.length ?? (node.max >= MANY ? "" : `≤ ${node.max}`)}]`
 
 function bool(node, path, controls) {
   const input = h("input", { type: "checkbox" })
@@ -194,7 +197,7 @@ function list(node, path, controls) {
     inner.pop()?.elements.forEach(each => each.remove())
     check()
   }, { class: "quiet", hidden: node.length !== undefined })
-  const legend = h("legend", {}, node.name, " ", h("span", { class: "unit" }, `[${node.length ?? `≤ ${node.max}`}]`))
+  const legend = h("legend", {}, node.name, " ", h("span", { class: "unit" }, countOf(node)))
   return {
     elements: [h("fieldset", { class: "group" }, legend, box, h("div", { class: "actions" }, add, remove))],
     read: () => inner.map(each => each.read()),

@@ -113,7 +113,7 @@ class ServicesView {
 
   #show(request) {
     this.#form = new MessageForm(request)
-    this.#box.replaceChildren(h("h3", {}, request.type || "Request"), this.#form.element)
+    this.#box.replaceChildren(h("h3", {}, "Request"), this.#form.element)
     this.#actions.hidden = false
   }
 
