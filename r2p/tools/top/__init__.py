@@ -17,6 +17,9 @@ from r2p.tools.session import Session, UsageError, joined
 from r2p.tools.top.plain import PlainTop
 from r2p.tools.top.tables import VIEWS, View
 
+PERIOD = 1.0
+"""Seconds between two looks."""
+
 _INSTALL = "a screen needs textual: pip install 'r2p[ui]'; without it, tables are printed"
 
 
@@ -41,7 +44,7 @@ async def top(
             help="Subscribe to this topic, for its latency and losses (repeatable).",
         ),
     ] = None,
-    period: Annotated[float, time_option("--period", "Between two looks; default: 1.")] = 1.0,
+    period: Annotated[float | None, time_option("--period", "Between two looks; default: 1.")] = None,
     allow_control: Annotated[
         bool, typer.Option("--allow-control", help="Let parameters of nodes be set on the screen.")
     ] = False,
@@ -59,7 +62,7 @@ async def top(
     """
     chosen = VIEWS[view]
     _check_sort(chosen, sort)
-    async with NetworkMonitor(session.module, period=period) as monitor:
+    async with NetworkMonitor(session.module, period=period or PERIOD) as monitor:
         for topic in measure or ():
             monitor.measure(topic)
         if _wants_screen(count=1 if once else count, format=format):

@@ -307,7 +307,7 @@ class TablesScreen(Screen[None]):
         topic = self._topic_of(self.query_one(FiguresTable).selected)
         line = self.query_one(KeyLine)
         if topic is None:
-            line.say("only topics can be measured: press 1")
+            line.say("only topics can be measured: choose one in table 1")
         else:
             line.say(self._details.toggle_measuring(topic))
 

@@ -80,7 +80,7 @@ def _map(owners: list[str | None], letters: dict[str, str], width: int) -> list[
     per_line = max(10, (width - 5) // 20 * 10)
     lines = []
     for start in range(0, len(owners), per_line):
-        line = Text(f"{start:3}  ", style="dim")
+        line = Text().append(f"{start:3}  ", style="dim")
         for owner in owners[start : start + per_line]:
             line.append("." if owner is None else letters[owner], style=_style(owner, letters)).append(" ")
         lines.append(line)

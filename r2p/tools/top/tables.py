@@ -133,28 +133,35 @@ def _topic_alarm(row: TopicFigures) -> int:
     return ALARM if row.mismatch else OK
 
 
-def lost(row: TopicFigures) -> int:
-    """Return all that publishers missed, and that was lost, as far as it is known."""
-    return (row.missed or 0) + (row.lost_on_way or 0) + (row.lost_here or 0)
+_Losses = tuple[int | None, int | None, int | None]
+
+
+def _losses(row: TopicFigures) -> _Losses:
+    return row.missed, row.lost_on_way, row.lost_here
 
 
 class RecentLosses:
     """Notes which topics have lost something of late: what a robot lost at its start must not be red for ever."""
 
     def __init__(self) -> None:
-        self._lost: dict[str, int] = {}
+        self._lost: dict[str, _Losses] = {}
         self._until: dict[str, int] = {}  # ns
 
     def note(self, snapshot: NetworkSnapshot) -> None:
-        """Compare the losses of all topics with those of the last snapshot."""
-        before, self._lost = self._lost, {row.name: lost(row) for row in snapshot.topics}
-        grown = [name for name, now in self._lost.items() if now > before.get(name, now)]
+        """Compare the losses of all topics with those of the last snapshot, as far as they were known then."""
+        before, self._lost = self._lost, {row.name: _losses(row) for row in snapshot.topics}
+        grown = [name for name, now in self._lost.items() if _has_grown(before.get(name, now), now)]
         self._until = {name: end for name, end in self._until.items() if end > snapshot.time}
         self._until |= dict.fromkeys(grown, snapshot.time + _RECENT)
 
     def alarm(self, row: Any) -> int:
         """Return how much attention the row of a topic needs."""
         return ALARM if row.name in self._until else TOPICS.alarm(row)
+
+
+def _has_grown(before: _Losses, now: _Losses) -> bool:
+    pairs = zip(before, now, strict=True)
+    return now != before and any(old is not None and new is not None and new > old for old, new in pairs)
 
 
 def _topics(snapshot: NetworkSnapshot) -> list[TopicFigures]:

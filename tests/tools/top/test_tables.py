@@ -78,6 +78,13 @@ def test_a_topic_that_lost_something_is_marked_for_ten_seconds(seconds: int, ala
     assert [losses.alarm(row) for row in TOPICS.rows(last)] == [OK, alarm, OK]
 
 
+def test_losses_of_before_the_first_answer_of_a_module_are_not_new() -> None:
+    losses = RecentLosses()
+    for snapshot in (network(topics=[topic("imu")]), network(topics=[topic("imu", missed=50, lost_on_way=3)])):
+        losses.note(snapshot)
+    assert losses.alarm(topic("imu")) == OK
+
+
 def test_rows_that_need_attention() -> None:
     snapshot = network(topics=[topic("imu", mismatch=True)])
     alarms = {name: [view.alarm(row) for row in view.rows(snapshot)] for name, view in VIEWS.items()}
