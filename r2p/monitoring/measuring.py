@@ -84,7 +84,7 @@ class MeasuredTopic:
         """Count a message. `Topic.deliver` calls this with each one, so it is short."""
         self._messages += 1
         self._bytes += len(sample.data)
-        if sample.stamped or sample.hops:
+        if (sample.stamped or sample.hops) and sample.stamp:
             self._delayed += 1
             self._delays.append(self._now() - sample.stamp)
         if number := sample.sequence:

@@ -1,6 +1,7 @@
 """Collects the figures of a module's network once a second."""
 
 import asyncio
+import contextlib
 import functools
 from types import TracebackType
 from typing import Self
@@ -25,7 +26,7 @@ from r2p.monitoring.rows import (
 )
 from r2p.monitoring.snapshot import NetworkSnapshot, TopicFigures
 from r2p.monitoring.topic_types import TypeFinder
-from r2p.names import RESERVED, topic_name
+from r2p.names import BUS_LOAD, BUS_SLOTS, RESERVED, topic_name
 from r2p.runtime.node import Node
 from r2p.units import SECOND
 
@@ -62,6 +63,7 @@ class NetworkMonitor:
         self._sources = FigureSources(BusTables(module, self._node), self.types)
         self._topic_rows = TopicRows(self._sources)
         self._polls: dict[str, asyncio.Task[None]] = {}
+        self._learning: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
         """Begin to collect. Raises Closed if the module is not open."""
@@ -72,7 +74,7 @@ class NetworkMonitor:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        tasks = [self._task, *self._polls.values()]
+        tasks = [self._task, *self._polls.values(), *filter(None, [self._learning])]
         for task in tasks:
             task.cancel()
         await asyncio.wait(tasks)
@@ -137,11 +139,12 @@ class NetworkMonitor:
         buses = sources.buses.look()
         modules = network.modules()
         self._poll({view.name for view in modules if can_be_asked(view)})
-        topics = network.topics()
+        topics = {name: view for name, view in network.topics().items() if not self._is_own_wish(view)}
         left_out = max(0, len(topics) - TOPICS_MAX)
         if left_out:
             topics = dict(list(topics.items())[:TOPICS_MAX])
         sources.sum_up(topics)
+        self._learn(topics)
         before = self.snapshot
         self.snapshot = NetworkSnapshot(
             time=self._clock.now(),
@@ -156,6 +159,14 @@ class NetworkMonitor:
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
 
+    def _is_own_wish(self, view: TopicView) -> bool:
+        """Return whether only this tool would have the topic: what a bus reports, if there is one."""
+        return (
+            view.name.endswith((BUS_LOAD, BUS_SLOTS))
+            and not (view.published_on or view.publishers)
+            and all(not each.link and each.node == _NODE for each in view.subscribers)
+        )
+
     async def _collect_topics(self, topics: dict[str, TopicView]) -> list[TopicFigures]:
         """Return the rows of topics, in several turns of the event loop."""
         before = {row.name: row for row in self.snapshot.topics}
@@ -167,6 +178,27 @@ class NetworkMonitor:
             if len(rows) % _AT_ONCE == 0:
                 await asyncio.sleep(0)
         return rows
+
+    # Types
+
+    def _learn(self, topics: dict[str, TopicView]) -> None:
+        """Ask for types that are unknown, one after the other, unless that is being done."""
+        if self._learning is not None and not self._learning.done():
+            return
+        unknown = {
+            view.fingerprint: view.name
+            for view in topics.values()
+            if view.fingerprint is not None and not (view.ros_type or view.layout)
+            if self.types.by_fingerprint(view.fingerprint) is None
+        }
+        if unknown:
+            finding = self._find_types(list(unknown.values()))
+            self._learning = asyncio.create_task(finding, name=f"{self._module.name} finds types")
+
+    async def _find_types(self, topics: list[str]) -> None:
+        with contextlib.suppress(Closed):
+            for topic in topics:
+                await self.types.find(topic)
 
     # Statistics
 

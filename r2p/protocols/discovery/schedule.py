@@ -1,8 +1,9 @@
 """The schedule of announcements: a ring of everything to repeat, step by step, never faster than the link's rate.
 
-New items go first (`_fresh`), then join the ring. A request for everything only raises the number of steps that don't
-wait (`_eager`) to one full turn, so that fifty requests at once cost one turn. Items that only describe, endpoints and
-names, leave the ring after two turns for one that turns more slowly (`_slow`), until a module is new.
+New items go first (`_fresh`), after a presence that is overdue, then join the ring. A request for everything only
+raises the number of steps that don't wait (`_eager`) to one full turn, so that fifty requests at once cost one turn.
+Items that only describe, endpoints and names, leave the ring after two turns for one that turns more slowly (`_slow`),
+until a module is new.
 """
 
 from collections import OrderedDict
@@ -170,7 +171,7 @@ class Schedule:
             self._repeat(now)
             if self.due() > now:
                 return None
-        if self._fresh:
+        if self._fresh and now - self._presence_at < _ROUND:  # a thousand new topics outlast the lease of the module
             item, _ = self._fresh.popitem(last=False)
             if not item.once:
                 self._ring[item] = None

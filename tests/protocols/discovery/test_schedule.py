@@ -49,6 +49,21 @@ class TestSchedule:
         assert names[:6] == ["t0", "t2", "t3"] * 2
         assert set(names[-6:]) == {"t2", "t3"}
 
+    def test_a_thousand_new_items_keep_no_presence_back_for_longer_than_a_lease(self) -> None:
+        schedule = Schedule(100, 10, 0)
+        schedule.start(0)
+        for number in range(1000):
+            schedule.add(Item(ItemKind.PUBLISHER, (f"t{number}",)))
+        presences, others = [0], 0
+        for now in range(0, 12 * S, 10 * MS):
+            while (each := schedule.pop(now)) is not None:
+                schedule.sent(now, 1)
+                if each.kind is ItemKind.PRESENCE:
+                    presences.append(now)
+                others += each.kind is ItemKind.PUBLISHER
+        assert max(later - earlier for earlier, later in pairwise(presences)) <= 3.5 * S
+        assert others >= 1000
+
     def with_endpoints(self, count: int) -> tuple[Schedule, list[Item]]:
         """They have been said for 10 s: seldom by now."""
         schedule = Schedule(1000, 100, 0)
