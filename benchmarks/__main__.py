@@ -21,6 +21,7 @@ ALL = (
     "foxglove",
     "recording",
     "recording_edit",
+    "monitoring",
     "rtcan",
     "timers",
     "playing",

@@ -1,18 +1,18 @@
-"""The share of a core that the monitor behind `r2p top` and `r2p dash` takes with 1 000 topics, over TCP."""
+"""The share of a core that the monitor behind `r2p top` and `r2p dash` takes with 1 000 topics, over zenoh."""
 
 import asyncio
 import time
 from collections.abc import Iterator
+from contextlib import AsyncExitStack
 from multiprocessing.connection import Connection
 
 import r2p
+from benchmarks import zenoh
 from benchmarks.loops import run_on
 from benchmarks.processes import process
 from benchmarks.table import Row
 from r2p.monitoring.monitor import NetworkMonitor
 from r2p.msg import Led
-from r2p.transports.tcp import TcpListenTransport
-from r2p.transports.url import parse
 
 MODULES, TOPICS = 20, 50  # of each module
 PERIOD = 1.0  # s, of each topic and of the monitor
@@ -31,27 +31,25 @@ async def _publish(node: r2p.Node) -> None:
         publishers.append(publishers.pop(0))
 
 
-async def _robot(port: int) -> None:
-    async with asyncio.TaskGroup() as tasks:
+async def _robot(pipe: Connection) -> None:
+    """Run a router, and the modules."""
+    async with AsyncExitStack() as stack:
+        router = r2p.Module("ROUTER", via=zenoh.LISTEN.replace("peer", "router"), watchdog=False)
+        port = zenoh.port_of(await stack.enter_async_context(router))
         for number in range(MODULES):
-            tasks.create_task(_module(f"MODULE{number}", port))
-
-
-async def _module(name: str, port: int) -> None:
-    async with r2p.Module(name, via=f"tcp:127.0.0.1:{port}", watchdog=False) as module:
-        module.start(_publish)
-        await module.wait()
+            module = r2p.Module(f"MODULE{number}", via=zenoh.connect(port), watchdog=False)
+            (await stack.enter_async_context(module)).start(_publish)
+        pipe.send(port)
+        await asyncio.get_running_loop().create_future()
 
 
 def _process(pipe: Connection) -> None:
-    run_on("uvloop", _robot(pipe.recv()))
+    run_on("uvloop", _robot(pipe))
 
 
 async def _shares(pipe: Connection) -> tuple[float, float, int, int]:
     """Return the share of a core without a monitor and with one, its topics, and those whose rate it knows."""
-    transport = TcpListenTransport(parse("tcp-listen:127.0.0.1:0"))
-    async with r2p.Module("PC", via=transport, observer=True, watchdog=False) as module:
-        pipe.send(transport.port)
+    async with r2p.Module("PC", via=zenoh.connect(pipe.recv()), observer=True, watchdog=False) as module:
         while len(module.network.topics()) < MODULES * TOPICS:  # noqa: ASYNC110 - there is no event
             await asyncio.sleep(0.1)
         await asyncio.sleep(SETTLING)

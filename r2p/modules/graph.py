@@ -21,7 +21,7 @@ from r2p.modules import parameter_services
 from r2p.modules.link_manager import LinkManager
 from r2p.modules.own_services import unknown_operation
 from r2p.modules.remote_nodes import RemoteNodes
-from r2p.modules.statistics import ModuleStatistics, decode
+from r2p.modules.statistics import COMPRESSED, ModuleStatistics, decode
 from r2p.modules.type_lookup import find_type
 from r2p.parameters.definition import ParameterInfo
 from r2p.protocols.discovery.directory import EndpointInfo
@@ -136,7 +136,7 @@ class NetworkView:
         Raises Error if there is no such module, or it can't answer, and TimeoutError if it does not.
         """
         firmware = "it counts nothing that others can ask for"
-        content = await self.ask(module, Operation.STATISTICS, what="statistics", firmware=firmware)
+        content = await self.ask(module, Operation.STATISTICS, COMPRESSED, what="statistics", firmware=firmware)
         try:
             return decode(content)
         except DecodeError as error:

@@ -154,7 +154,7 @@ class Module:
             bridge=self._bridge_options,
             allow_control=self._allow_control,
         )
-        self._opened.own_services.serve(Operation.STATISTICS, lambda _argument: encode(self.statistics()))
+        self._opened.own_services.serve(Operation.STATISTICS, lambda argument: encode(self.statistics(), argument))
         self._node_control.serve(self._opened.own_services, clock, self._check_startable)
         ParameterServices(self.parameters, self._opened.own_services, clock, self._opened.random, self.refused)
         self._switching = asyncio.Lock()

@@ -8,6 +8,7 @@ import itertools
 import math
 import os
 import struct
+import zlib
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, TypeVar
 
@@ -26,6 +27,12 @@ M = TypeVar("M", bound=Message)
 
 VERSION = 1
 
+COMPRESSED = b"zlib"
+"""The argument of a request for a compressed answer, which a module of before answers with a plain one."""
+
+_ZLIB = b"\x78"  # what compressed content begins with; no version will have this number
+_COMPRESSION = 1  # the fastest: names that repeat cost little, and counters are mostly zero
+_CONTENT_MAX = 1 << 20  # bytes: five times the longest plain content
 _MAX = 4096  # entries of each kind: more than fit the pages of an answer
 _HEAD = struct.Struct("<BI")  # the version, and the bytes of the first part
 
@@ -141,20 +148,34 @@ class ModuleStatistics(Message, name="r2p_msgs/ModuleStatistics"):
     forwarded: Annotated[tuple[ForwardedTopic, ...], Max(_MAX)] = ()
 
 
-def encode(statistics: ModuleStatistics) -> bytes:
-    """Encode the content of an answer."""
+def encode(statistics: ModuleStatistics, argument: bytes = b"") -> bytes:
+    """Encode the content of an answer; `argument` is that of the request, and may ask for a compressed one."""
     part = statistics.encode()
-    return _HEAD.pack(VERSION, len(part)) + part
+    content = _HEAD.pack(VERSION, len(part)) + part
+    return zlib.compress(content, _COMPRESSION) if argument == COMPRESSED else content
 
 
 def decode(data: bytes) -> ModuleStatistics:
-    """Decode the content of an answer, of this version or a later one. Raises DecodeError."""
+    """Decode the content of an answer, of this version or a later one, compressed or not. Raises DecodeError."""
+    if data.startswith(_ZLIB):
+        data = _decompress(data)
     if len(data) < _HEAD.size:
         raise DecodeError("not the statistics of a module")
     version, length = _HEAD.unpack_from(data)
     if version < VERSION or length > len(data) - _HEAD.size:
         raise DecodeError(f"statistics of version {version}, whose first part has {length} bytes")
     return layout(ModuleStatistics).decode(data[_HEAD.size : _HEAD.size + length])
+
+
+def _decompress(data: bytes) -> bytes:
+    try:
+        reader = zlib.decompressobj()
+        content = reader.decompress(data, _CONTENT_MAX)
+    except zlib.error as error:
+        raise DecodeError(f"compressed statistics are damaged: {error}") from error
+    if not reader.eof:
+        raise DecodeError(f"compressed statistics are cut off, or longer than {_CONTENT_MAX} bytes")
+    return content
 
 
 def collect(manager: LinkManager, supervisors: Mapping[str, Supervisor]) -> ModuleStatistics:

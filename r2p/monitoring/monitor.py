@@ -15,7 +15,7 @@ from r2p.modules.statistics import ModuleStatistics
 from r2p.monitoring.buses import BusTables
 from r2p.monitoring.counters import ModuleCounters
 from r2p.monitoring.measuring import MeasuredTopic
-from r2p.monitoring.polling import can_be_asked, poll_statistics
+from r2p.monitoring.polling import StatisticsPolling, can_be_asked
 from r2p.monitoring.rows import (
     FigureSources,
     TopicRows,
@@ -36,6 +36,7 @@ TOPICS_MAX = 10_000
 _NODE = "monitor"
 _MODULES_MAX = 256  # modules that are asked: their names come from the network
 _ENTRIES_MAX = 50_000  # entries that are kept of all answers
+_ENTRIES_PER_SECOND = 2_500  # of answers, about 200 messages: a larger network is asked less often
 _AT_ONCE = 200  # topics in one turn of the event loop
 _SHARE = 20  # times as long as collecting takes, it rests: a network of any size takes a twentieth of the loop
 
@@ -62,6 +63,7 @@ class NetworkMonitor:
         self._node = Node(_NODE, module.space)
         self._sources = FigureSources(BusTables(module, self._node), self.types)
         self._topic_rows = TopicRows(self._sources)
+        self._polling = StatisticsPolling(module, period)
         self._polls: dict[str, asyncio.Task[None]] = {}
         self._learning: asyncio.Task[None] | None = None
 
@@ -210,9 +212,10 @@ class NetworkMonitor:
         for name in sorted(names - self._polls.keys())[: _MODULES_MAX - len(self._polls)]:
             counters = self._sources.counters[name] = ModuleCounters()
             on_answer = functools.partial(self._answered, name, counters)
-            polling = poll_statistics(self._module, name, self._period, on_answer, counters.silence)
-            self._polls[name] = asyncio.create_task(polling, name=f"monitor asks {name}")
+            asking = self._polling.run(name, on_answer, counters.silence)
+            self._polls[name] = asyncio.create_task(asking, name=f"monitor asks {name}")
 
     def _answered(self, name: str, counters: ModuleCounters, statistics: ModuleStatistics) -> None:
         others = sum(each.entries for each in self._sources.counters.values() if each is not counters)
         counters.update(name, statistics, _ENTRIES_MAX - others)
+        self._polling.period = max(self._period, (others + counters.entries) / _ENTRIES_PER_SECOND)

@@ -1,11 +1,12 @@
-"""Asks modules for their statistics, each by a task of its own, so a slow or silent one delays no other.
+"""Asks modules for their statistics, each by a task of its own, so one by a slow link delays no other.
 
-A slow one is asked less often. On RTCAN, on serial lines, and behind gateways, answers take capacity from the robot:
-there a module whose answer takes longer than 5 ms is asked less often than once a second, and each 10 s if it takes
-50 ms or more.
+A module whose answer takes long is asked less often. On RTCAN, on serial lines, and behind gateways, answers take
+capacity from the robot: there a module whose answer takes longer than 5 ms is asked less often than once a second, and
+each 10 s if it takes 50 ms or more.
 """
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 
 from r2p.codecs.own_services import WIRE_MIN
@@ -20,7 +21,8 @@ PERIOD = 1.0
 RETRY = 5.0
 """Seconds until a module that does not answer is asked again."""
 
-_REST = 4  # times as long as an answer took, nothing is asked ...
+_NEAR_AT_ONCE = 4  # modules: together they answer as fast as a link takes answers
+_REST = 1  # times as long as an answer took, nothing is asked ...
 _REST_SLOW = 200  # ... where links may be slow, whose capacity is for the robot ...
 _PERIOD_SLOW = 10.0  # s, ... but no longer than this, or than the former
 
@@ -44,11 +46,11 @@ class QuestionPace:
     async def pause(self, period: float = PERIOD) -> None:
         """Wait until the module may be asked again."""
         rest = _REST * self.took
-        if not self._is_near():
+        if not self.is_near():
             rest = max(rest, min(_REST_SLOW * self.took, _PERIOD_SLOW))
         await asyncio.sleep(max(period, rest))
 
-    def _is_near(self) -> bool:
+    def is_near(self) -> bool:
         """Return whether a fast link leads to the module, without a gateway in between."""
         if self._name == self._module.name:
             return True
@@ -59,25 +61,38 @@ class QuestionPace:
         return False
 
 
-async def poll_statistics(
-    module: Module,
-    name: str,
-    period: float,
-    on_answer: Callable[[ModuleStatistics], None],
-    on_silence: Callable[[str], None],
-) -> None:
-    """Ask a module for its statistics again and again, until cancelled; `on_silence` gets the reason of a failure."""
-    pace, clock = QuestionPace(module, name), module.space.clock
-    while True:
-        started = clock.monotonic()
-        try:
-            statistics = module.statistics() if name == module.name else await module.network.statistics(name)
-        except Closed:
-            return
-        except (Error, TimeoutError) as error:
-            on_silence(str(error))
-            await pace.pause(RETRY)
-            continue
-        pace.took = (clock.monotonic() - started) / SECOND
-        on_answer(statistics)
-        await pace.pause(period)
+class StatisticsPolling:
+    """Asks modules for their statistics, each by `run`."""
+
+    def __init__(self, module: Module, period: float) -> None:
+        self.period = period
+        """Seconds between two questions to a module, at least."""
+        self._module = module
+        self._clock = module.space.clock
+        self._turns = asyncio.Semaphore(_NEAR_AT_ONCE)
+
+    async def run(
+        self, name: str, on_answer: Callable[[ModuleStatistics], None], on_silence: Callable[[str], None]
+    ) -> None:
+        """Ask a module again and again, until cancelled; `on_silence` gets the reason of a failure."""
+        pace = QuestionPace(self._module, name)
+        while True:
+            try:
+                statistics = await self._ask(name, pace)
+            except Closed:
+                return
+            except (Error, TimeoutError) as error:
+                on_silence(str(error))
+                await pace.pause(RETRY)
+            else:
+                on_answer(statistics)
+                await pace.pause(self.period)
+
+    async def _ask(self, name: str, pace: QuestionPace) -> ModuleStatistics:
+        if name == self._module.name:
+            return self._module.statistics()
+        async with self._turns if pace.is_near() else contextlib.nullcontext():
+            started = self._clock.monotonic()
+            statistics = await self._module.network.statistics(name)
+            pace.took = (self._clock.monotonic() - started) / SECOND
+            return statistics

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import zlib
 
 import pytest
 from hypothesis import given
@@ -112,12 +113,23 @@ async def test_modules_without_statistics() -> None:
             await b.network.statistics("EVE")
 
 
-@given(st.binary(max_size=300))
-def test_any_bytes_are_statistics_or_a_decode_error(data: bytes) -> None:
+@given(st.binary(max_size=300), st.booleans())
+def test_any_bytes_are_statistics_or_a_decode_error(data: bytes, compressed: bool) -> None:
     try:
-        statistics.decode(data)
+        statistics.decode(zlib.compress(data) if compressed else data)
     except DecodeError:
         return
+
+
+def test_compressed_answers_are_short_and_bounded() -> None:
+    publishers = tuple(r2p.PublisherStatistics(f"arm/joint{number}", "arm", 1, number) for number in range(100))
+    known = r2p.ModuleStatistics(publishers=publishers)
+    data = statistics.encode(known, statistics.COMPRESSED)
+    assert len(data) < len(statistics.encode(known, b"another argument")) / 4
+    assert statistics.decode(data) == known
+    for wrong in (data[:-1], b"\x78", b"\x78\x01 no zlib", zlib.compress(bytes(1 << 24))):
+        with pytest.raises(DecodeError):
+            statistics.decode(wrong)
 
 
 def test_a_later_version_is_read_as_far_as_it_is_known() -> None:

@@ -39,7 +39,7 @@ async def test_rates_loads_and_slots_are_those_of_the_exact_bus() -> None:
         eye.subscribe("encoder", Led, lossy=True)
         await publisher.ready(timeout=10.0)
         await asyncio.sleep(5.0)
-        loads = [(await figures(monitor, bool)).buses[0] for _ in range(20)]
+        loads = [(await figures(monitor, bool)).buses[0] for _ in range(8)]
         hrt = bus.hrt("BOSS")
         syncs = bus.sent(lambda each: each.laxity == rtcan.HRT and rtcan.high_byte(each.message_id) == 0)
         snapshot = monitor.snapshot
