@@ -28,7 +28,7 @@ LINES = "[...document.querySelectorAll('.log li')].map(each => each.textContent)
 
 
 class Computer(NamedTuple):
-    """Another module of the network, with a node that warns all the time, and what that was sent."""
+    """Another module of the network, of which a node warns all the time, and what another one was sent."""
 
     received: asyncio.Queue[Led]
 
@@ -42,6 +42,10 @@ async def computer(via: str) -> AsyncIterator[Computer]:
         node.subscribe("leds", Led, found.received.put_nowait)
         node.serve("turn", Velocity3, Velocity3, turn)
         started.set_result(found)
+        while True:
+            await node.spin()
+
+    async def watch(node: r2p.Node) -> None:
         async for _ in node.every(0.25):
             node.log.warning("the <b>door</b> is open")
             node.log.warning("the window is open")
@@ -51,6 +55,7 @@ async def computer(via: str) -> AsyncIterator[Computer]:
 
     async with r2p.Module("PC2", via=via) as module:
         module.start(panel)
+        module.start(watch)
         yield await started
 
 
