@@ -63,7 +63,7 @@ def channel_type(topic: str, cls: type[Message] | None, counts: Counter[str]) ->
         if converted is not None:
             return converted
     except MessageError as error:  # rosbags is not installed
-        problem = f"{topic} is a {layout(cls).name} here, not a {standard_type(cls, ROS2)}: {error}"
+        problem = f"{topic} has the type {layout(cls).name} here, not {standard_type(cls, ROS2)}: {error}"
     try:
         return RosChannelType(schema_of(cls), _copied(cls, counts), problem)
     except MessageError as error:

@@ -61,7 +61,8 @@ class NetworkParameters:
         self._changed = changed
         self._report = report
         self._following: dict[str, asyncio.Task[None]] = {}
-        self._silent: set[str] = set()
+        self._silent: dict[str, str] = {}
+        """Why modules have not answered the last question, in words."""
 
     async def fetch(self, names: _Names = ()) -> list[ParameterInfo]:
         """Return the parameters of these names; without a name those of all modules."""
@@ -79,11 +80,10 @@ class NetworkParameters:
         try:
             infos = await self._network.parameters(module)
         except (Error, TimeoutError) as error:
-            self._silent.add(module)
+            self._silent[module] = str(error)
             self._report(module, f"the parameters of {module} are unknown: {error}")
             return []
-        if module in self._silent:
-            self._silent.discard(module)
+        if self._silent.pop(module, None) is not None:
             self._report(module, "")
         return infos
 
@@ -94,7 +94,7 @@ class NetworkParameters:
         """Set parameters, those of one module all or none; return what was refused, in words."""
         given = {each.name: each for each in parameters}
         infos = {info.full_name: info for info in await self.fetch(given)} if given else {}
-        problems = [f"there is no parameter {name}" for name in given.keys() - infos.keys()]
+        problems = [self._unknown(name) for name in given.keys() - infos.keys()]
         changes: dict[str, dict[tuple[str, str], object]] = {}
         for name, info in infos.items():
             try:
@@ -109,6 +109,11 @@ class NetworkParameters:
             except (Error, TimeoutError) as error:
                 problems.append(str(error))
         return problems
+
+    def _unknown(self, name: str) -> str:
+        """Say why there is no parameter to set."""
+        reason = next((text for module, text in self._silent.items() if _is_of(module, [name])), "")
+        return f"{name} is not set: {reason}" if reason else f"there is no parameter {name}"
 
     # Changes
 

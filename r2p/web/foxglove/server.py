@@ -3,7 +3,7 @@
     async with FoxgloveServer(module) as foxglove, WebServer(options, {"/": foxglove.endpoint}) as server:
         ...
 
-It looks at the network twice a second, and subscribes to what clients want: without one it costs next to nothing.
+While there are clients, it looks at the network twice a second; it subscribes to nothing but what they want.
 """
 
 import asyncio
@@ -13,6 +13,7 @@ from typing import Self
 
 from r2p.clock import sleep_in_background
 from r2p.errors import Closed
+from r2p.log_lines import get_logger
 from r2p.modules.module import Module
 from r2p.parameters.definition import ParameterInfo
 from r2p.units import MILLISECOND
@@ -28,6 +29,8 @@ from r2p.web.server import WebEndpoint
 
 ORIGINS = ("https://app.foxglove.dev", "file://")
 """Pages that may connect: Foxglove in a browser, and the programs Foxglove and Lichtblick, whose pages are files."""
+
+logger = get_logger("r2p.web")
 
 _REVIEW = 0.5  # seconds
 _TIME = "time"  # the stream of times, which lacks nothing but older ones
@@ -78,6 +81,8 @@ class FoxgloveServer:
 
     async def _serve(self, client: WebClient) -> None:
         session = FoxgloveSession(self.network, client)
+        if not self.sessions:
+            self.network.review()
         self._greet(client)
         self.sessions.append(session)
         try:
@@ -147,15 +152,18 @@ class FoxgloveServer:
 
     async def _watch(self) -> None:
         while True:
+            await sleep_in_background(_REVIEW)
             try:
                 self._review()
             except Closed:
                 return
-            await sleep_in_background(_REVIEW)
+            except Exception:
+                logger.exception("internal error: clients of Foxglove's protocol are not informed of what has changed")
 
     def _review(self) -> None:
         """Inform clients of what has changed in the network, and of what they have lost."""
-        self.network.review()
+        if self.sessions:
+            self.network.review()
         for session in self.sessions:
             session.report_losses()
         if any(session.follows_parameters for session in self.sessions):

@@ -167,7 +167,7 @@ class FoxgloveSession:
             return
         try:
             publication.publish(message.data)
-        except Error as error:
+        except (Error, ValueError, ArithmeticError) as error:  # numbers that no conversion has foreseen
             self._refuse("invalid message", f"{publication.channel.topic}: {error}")
 
     def _call(self, call: protocol.ServiceCall) -> None:

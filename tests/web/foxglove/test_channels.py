@@ -12,6 +12,7 @@ from r2p.msg import Header, LaserScan, Led, Log, Odometry, Pose3
 from r2p.ros.cdr import cdr
 from r2p.testing.network import Network, node_in
 from r2p.web import client as web_client
+from r2p.web.foxglove import channel_types
 from tests.tools.rig import Firmware, keep_types
 from tests.web.foxglove.rig import serving, until, viewer
 
@@ -83,6 +84,26 @@ async def test_standard_types_are_those_of_ros_and_poses_are_transforms_too() ->
             assert (record.level, record.msg) == (30, "careful")
             node.advertise("robot1/tf", r2p.msg.Text)  # of its own: then none is made
             await until(lambda: "/tf" not in one.channels)
+
+
+async def test_without_the_definitions_of_ros_topics_have_the_types_of_r2p(monkeypatch: pytest.MonkeyPatch) -> None:
+    def conversion(*_args: object) -> None:
+        raise r2p.MessageError("the definitions of ROS are in rosbags: pip install 'r2p[ros]'")
+
+    monkeypatch.setattr(channel_types, "conversion", conversion)
+    network = Network()
+    async with network.node("BASE") as node, network.module("PC", observer=True) as pc, serving(pc) as server:
+        odometry = node.advertise("odometry", Odometry)
+        async with viewer(server) as one:
+            await until(lambda: "/odometry" in one.channels and one.status)
+            assert one.channels["/odometry"]["schemaName"] == "r2p_msgs/msg/Odometry"
+            expected = "odometry has the type r2p_msgs/Odometry here, not nav_msgs/Odometry: the definitions of ROS are"
+            assert any(each.startswith(expected) for each in one.status)
+            one.subscribe("/odometry", 1)
+            await odometry.wait_subscriber()
+            await odometry.publish(Odometry(Pose3(x=1.0)))
+            await until(lambda: one.data)
+            assert one.decoded("/odometry")[0].pose.x == 1.0
 
 
 async def test_a_header_without_a_stamp_gets_that_of_the_message() -> None:

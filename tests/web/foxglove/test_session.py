@@ -299,6 +299,9 @@ async def test_parameters_are_read_set_and_followed() -> None:
     [
         ({"name": "BASE/test.gain", "value": 11}, "BASE/test.gain"),
         ({"name": "BASE/test.gain", "value": "much"}, "much"),
+        ({"name": "BASE/test.steps", "value": 1 << 70}, "BASE/test.steps"),
+        ({"name": "BASE/test.gain", "value": 1 << 2000}, "BASE/test.gain"),
+        ({"name": "BASE/test.gain", "value": True}, "BASE/test.gain"),
         ({"name": "BASE/test.gain", "value": {"a": [1]}}, "BASE/test.gain"),
         ({"name": "BASE/test.gain", "value": [[1]]}, "BASE/test.gain"),
         ({"name": "BASE/test.gain", "value": "AAAA", "type": "byte_array"}, "are not bytes"),
@@ -315,11 +318,12 @@ async def test_a_value_that_is_refused_leaves_all_as_they_are(parameter: dict[st
         viewer(server) as one,
     ):
         gain, steps = node.parameter("gain", 1.5, max=10.0), node.parameter("steps", 3)
+        other = node.parameter("other", 3)
         await until(lambda: any(each.name == "BASE" for each in pc.network.modules()))
-        one.say("setParameters", parameters=[{"name": "BASE/test.steps", "value": 4}, parameter])
+        one.say("setParameters", parameters=[{"name": "BASE/test.other", "value": 4}, parameter])
         await until(lambda: one.status and one.got("parameterValues"))
         assert text in one.status[0]
-        assert (gain.value, steps.value) == (1.5, 3)
+        assert (gain.value, steps.value, other.value) == (1.5, 3, 3)
         assert server.refused == {"invalid parameter": 1}
 
 
