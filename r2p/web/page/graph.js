@@ -219,9 +219,10 @@ class GraphView {
   #links(element) {
     const app = this.#app
     const wanted = element.kind === "topic"
-      ? [["topic", "Open the topic", element.label], ["publish", "Publish it", element.label]]
-      : [["nodes", "Open the module", element.module], ["parameters", "Parameters", element.module]]
-    const links = wanted.filter(([view]) => app.has(view))
+      ? [["overview", "All figures", `topic/${element.label}`], ["publish", "Publish", element.label]]
+      : [["nodes", "Start and stop", element.module], ["parameters", "Parameters", element.module]]
+    const isShown = view => !app.hello?.recording || !["publish", "parameters"].includes(view)
+    const links = wanted.filter(([view]) => app.has(view) && isShown(view))
       .map(([view, text, argument]) => h("a", { class: "button", href: app.address(view, argument) }, text))
     return links.length ? [h("div", { class: "actions" }, links)] : []
   }

@@ -37,6 +37,7 @@ export function graphOf(store, { all = false, byModule = false, words = [], limi
     if (all || !isInfrastructure(topic)) addTopic(graph, topic, byModule, own)
   }
   if (!all) dropHelpers(graph, store, byModule)
+  addLone(graph, store, own)
   return cut(filtered(graph, words), limit)
 }
 
@@ -58,8 +59,18 @@ export function isInfrastructure(topic) {
 function addNodes(graph, store, byModule, own) {
   for (const module of store.modules.values()) {
     if (own.has(module.name)) continue
-    const names = byModule || !module.nodes?.length ? [""] : module.nodes.map(node => node.name)
+    const names = byModule ? [""] : (module.nodes ?? []).map(node => node.name)
     for (const name of names) addNode(graph, module.name, name, module)
+  }
+}
+
+// Add modules of which neither nodes nor topics are known.
+function addLone(graph, store, own) {
+  const seen = new Set([...store.topics.values()].flatMap(({ publishers = [], subscribers = [] }) => (
+    [...publishers, ...subscribers].map(end => end.module))))
+  for (const module of store.modules.values()) {
+    if (own.has(module.name) || module.nodes?.length || seen.has(module.name)) continue
+    addNode(graph, module.name, "", module)
   }
 }
 

@@ -26,7 +26,8 @@ export function poseOf({ type = "", fields }) {
     const turn = form.turn && QUATERNION.map(name => under(form.turn, name))
     if (turn?.every(path => paths.has(path))) return { x, y, turn }
     const angle = form.angle?.map(name => under(form.at, name)).find(path => paths.has(path))
-    return angle ? { x, y, angle } : { x, y }
+    if (angle) return { x, y, angle }
+    if (!form.angle?.length) return { x, y }
   }
   return null
 }
