@@ -1,11 +1,12 @@
 """A running network as the source of pages."""
 
+import contextlib
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import Any, Self
 
-from r2p.errors import WebError
+from r2p.errors import InvalidName, WebError
 from r2p.messages import Message, layout
 from r2p.messages.values import to_plain
 from r2p.modules.module import Module
@@ -91,6 +92,7 @@ class LiveSession(SourceSession):
         self._first = True
         self._streams: dict[int, tuple[str, PlotStream]] = {}
         self._watched: set[str] = set()
+        self._measured: set[str] = set()
         self._log: PageLog | None = None
         self._publications = Publications(source.feeds, client)
         self._answers: dict[type, Answer] = {
@@ -136,7 +138,7 @@ class LiveSession(SourceSession):
         for topic, stream in self._streams.values():
             self._source.feeds.stop_plot(topic, stream)
         for topic in self._watched:
-            self._source.feeds.unwatch(topic, self._client)
+            self._end_watch(topic)
         self._streams.clear()
         self._watched.clear()
         if self._log is not None:
@@ -183,11 +185,20 @@ class LiveSession(SourceSession):
             raise WebError(f"a page watches at most {WATCHES_MAX} topics: close one")
         self._source.feeds.watch(request.topic, self._client)
         self._watched.add(request.topic)
+        with contextlib.suppress(InvalidName):  # of r2p's own topics there is nothing to measure
+            self._source.monitor.measure(request.topic)
+            self._measured.add(request.topic)
 
     async def _unwatch(self, request: protocol.Unwatch) -> None:
         if request.topic in self._watched:
             self._watched.remove(request.topic)
-            self._source.feeds.unwatch(request.topic, self._client)
+            self._end_watch(request.topic)
+
+    def _end_watch(self, topic: str) -> None:
+        self._source.feeds.unwatch(topic, self._client)
+        if topic in self._measured:
+            self._measured.remove(topic)
+            self._source.monitor.stop_measuring(topic)
 
     async def _follow_log(self, request: protocol.FollowLog) -> None:
         if self._log is None:

@@ -71,7 +71,7 @@ class StopPlot(_Request, tag="stop_plot"):
 
 
 class Watch(_Request, tag="watch"):
-    """Send the newest messages of a topic, decoded; `measure` also its latency and losses in its figures."""
+    """Send the newest messages of a topic, decoded; meanwhile its figures have its latency and its losses, too."""
 
     topic: str
 

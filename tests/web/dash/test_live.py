@@ -141,6 +141,9 @@ async def test_a_watched_topic_shows_its_newest_message_and_counts_the_others() 
         assert len(shown) + sum(each["skipped"] for each in shown) == 5
         assert shown[-1]["module"] == "ROBOT"
         assert shown[-1]["sequence"] == 5
+        await asyncio.sleep(1.0)
+        rows = [each["changed"].get("topics", {}).get("drive", {}) for each in page.news("state")]
+        assert any(row.get("measured") for row in rows), "a topic that is watched is measured"
 
 
 async def test_the_log_from_a_level_on() -> None:
