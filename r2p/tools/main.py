@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
+from r2p.errors import Error
 from r2p.log_lines import wrapped
 from r2p.startup import INTERRUPTED, raise_on_interrupt
 from r2p.tools.output import abandon_stdout, notify
@@ -200,7 +201,11 @@ def _load(name: str) -> Any:
     if name in GROUPS:
         return typer.main.get_command(importlib.import_module(GROUPS[name][0]).app)
     single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    single.command(name)(importlib.import_module(COMMANDS[name][0]).command)
+    try:
+        single.command(name)(importlib.import_module(COMMANDS[name][0]).command)
+    except Error as error:  # what it needs of an extra is not installed
+        notify(str(error))
+        raise SystemExit(1) from error
     return typer.main.get_command(single)
 
 

@@ -10,12 +10,16 @@ request has 16 KiB and ten seconds; a client's messages wait in the socket when 
 """
 
 import asyncio
+import contextlib
+import errno
 import functools
 import hmac
 import http
 import ipaddress
 import logging
+import os
 import secrets
+import socket
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from types import TracebackType
@@ -50,6 +54,7 @@ _REQUEST_TIME = 10.0  # seconds for a request and its answer
 _ORIGINS_MAX = 16  # refused pages whose names are kept
 _BACKLOG = 16  # connections that are accepted in one turn of the event loop
 _WRITE_BUFFER = 1 << 18  # bytes of a connection beyond which its client's own queue fills
+_PORT_ERRORS = (errno.EADDRINUSE, errno.EACCES)
 _CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -152,6 +157,7 @@ class WebServer:
     def link(self, view: str = "") -> str:
         """Return the address that opens a view of the page, as "/plots/odometry.x"."""
         host, port = self.address
+        host = _own_address(host) if ipaddress.ip_address(host).is_unspecified else host
         shown = f"[{host}]" if ":" in host else host
         fragment = view if self.token is None else f"token={quote(self.token, safe='')}{view}"
         return f"http://{shown}:{port}/" + (f"#{fragment}" if fragment else "")
@@ -162,9 +168,7 @@ class WebServer:
             with real_time():  # time-outs of clients, which have nothing to do with the time of a simulation
                 self._server = await self._listen()
         except OSError as error:
-            where = f"{self._options.host}:{self._options.port}"
-            text = f"can't listen on {where}: {error.strerror or error}; choose another --port, or 0 for a free one"
-            raise WebError(text) from error
+            raise WebError(self._not_listening(error)) from error
         return self
 
     async def _listen(self) -> Server:
@@ -191,6 +195,16 @@ class WebServer:
         """Stop listening, and close all connections."""
         self._server.close()
         await self._server.wait_closed()
+
+    def _not_listening(self, error: OSError) -> str:
+        """Say why the server can't listen, and what to do."""
+        number = error.errno or 0  # below 0 where a name is not known
+        reason = os.strerror(number) if number > 0 else error.strerror or str(error)
+        if number in _PORT_ERRORS:
+            advice = "choose another --port, or 0 for a free one"
+        else:
+            advice = "--host takes an address of this computer, or 0.0.0.0 for all of them"
+        return f"can't listen on {self._options.host}:{self._options.port}: {reason}; {advice}"
 
     # Connections
 
@@ -251,9 +265,12 @@ class WebServer:
         return _response(status, WebFile("text/plain", f"{status.phrase}: {reason}\n".encode()))
 
     def _is_own_host(self, headers: Headers) -> bool:
-        """Return whether a request names an address of this computer, not a name that a stranger's DNS gives it."""
+        """Return whether a request names an address of this computer, not a name that a stranger's DNS gives it.
+
+        With a token any name will do, as that of the robot: a page of a stranger does not have the token.
+        """
         host = urlsplit(f"//{headers.get('Host', '')}").hostname or ""
-        return host == "localhost" or host == self._options.host or _is_address(host)
+        return bool(self.token and host) or host in ("localhost", self._options.host) or _is_address(host)
 
     def _foreign_origins(self, headers: Headers) -> list[str]:
         """Return the pages that a request comes from, if it is neither this server's nor one that is allowed."""
@@ -294,6 +311,16 @@ class WebServer:
 def is_loopback(host: str) -> bool:
     """Return whether only programs of this computer reach an address."""
     return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def _own_address(wildcard: str) -> str:
+    """Return the address of this computer in its network, for a link that others open; nothing is sent."""
+    family, outside = (socket.AF_INET6, "2001:db8::1") if ":" in wildcard else (socket.AF_INET, "192.0.2.1")
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.connect((outside, 9))
+        address: str = probe.getsockname()[0]
+        return address
+    return socket.gethostname()
 
 
 def _is_address(host: str) -> bool:

@@ -10,6 +10,7 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
+from r2p.errors import WebError
 from r2p.web.dash.assets import page
 from r2p.web.server import CLIENTS_MAX, CONNECTIONS_MAX, WebEndpoint, WebOptions, WebServer
 from tests.transports.rtcan.networks import until
@@ -184,6 +185,29 @@ async def test_the_link_of_a_view_has_the_token_where_no_server_sees_it() -> Non
     async with serving() as server:
         assert server.link("/plots/leds.led") == f"http://127.0.0.1:{server.address[1]}/#/plots/leds.led"
         assert server.url == f"http://127.0.0.1:{server.address[1]}/"
+
+
+async def test_with_a_token_the_robot_may_have_any_name() -> None:
+    async with serving(_TOKEN) as server:
+        assert (await request(server, "GET / HTTP/1.1\nHost: robot.local\n\n")).startswith("HTTP/1.1 200 OK")
+        upgrade = "GET /echo HTTP/1.1\nHost: robot.local\nUpgrade: websocket\n\n"
+        assert (await request(server, upgrade)).startswith("HTTP/1.1 401 ")
+
+
+async def test_an_address_that_can_not_be_used_is_an_error_with_advice() -> None:
+    async with serving() as server:
+        with pytest.raises(WebError, match="Address already in use; choose another --port"):
+            async with WebServer(WebOptions(port=server.address[1]), {}):
+                pass
+    with pytest.raises(WebError, match="--host takes an address of this computer"):
+        async with WebServer(WebOptions(host="192.0.2.1"), {}):
+            pass
+
+
+async def test_the_link_of_a_server_on_all_addresses_has_one_that_others_can_open() -> None:
+    async with WebServer(WebOptions(host="0.0.0.0"), {}) as server:
+        assert "//0.0.0.0" not in server.url
+        assert f"#token={server.token}" in server.url
 
 
 async def test_only_loopback_goes_without_a_token() -> None:
