@@ -11,7 +11,6 @@ export const parameters = {
   id: "parameters",
   title: "Parameters",
   keys: [["Enter", "set the changed parameters of a node"]],
-  available: hello => !hello.recording,
   create: app => new ParametersView(app),
 }
 
@@ -20,6 +19,7 @@ class ParametersView {
   #modules = new Map() // ModuleParameters by name
   #queue = []
   #running = 0
+  #soon = null // a timer
   #words = []
   #list = h("div", { class: "stack" })
   #empty = h("p", { class: "empty" })
@@ -39,6 +39,7 @@ class ParametersView {
         button("Read again", () => this.#readAll(), { title: "Ask all modules for their parameters again" })),
       this.#hint, this.#empty, this.#list)
     app.connection.addEventListener("hello", () => this.element.isConnected && this.#readAll())
+    app.connection.addEventListener("clock", () => this.#readSoon())
   }
 
   show(argument) {
@@ -54,8 +55,17 @@ class ParametersView {
     this.#app.store.removeEventListener("change", this.#find)
   }
 
+  // Of a recording they are as they were, so its time has them read again.
+  #readSoon() {
+    if (this.#soon || !this.element.isConnected) return
+    this.#soon = setTimeout(() => {
+      this.#soon = null
+      this.#readAll()
+    }, 500)
+  }
+
   #readAll() {
-    this.#hint.hidden = !this.#app.hello || this.#app.hello.control
+    this.#hint.hidden = !this.#app.hello || this.#app.hello.control || this.#app.hello.recording
     for (const module of this.#modules.values()) this.#ask(module)
     this.#findModules()
   }
@@ -63,7 +73,7 @@ class ParametersView {
   #findModules() {
     const { modules } = this.#app.store
     for (const { name, kind, link } of modules.values()) {
-      if (kind === "firmware" || !link || this.#modules.has(name)) continue
+      if (kind === "firmware" || (!link && !this.#app.hello?.recording) || this.#modules.has(name)) continue
       const module = new ModuleParameters(this.#app, name)
       this.#modules.set(name, module)
       this.#ask(module)
@@ -314,7 +324,8 @@ class ParameterRow {
   take(parameter, { control }) {
     this.#parameter = parameter
     if (!this.#changedValue) this.#write(parameter.value)
-    const why = parameter.read_only ? "Read-only: it has its value from the start of the program"
+    const why = parameter.default === undefined ? "This is a recording"
+      : parameter.read_only ? "Read-only: it has its value from the start of the program"
       : control ? "" : "Start r2p dash with --allow-control to set it"
     this.#input.disabled = Boolean(why)
     this.#input.title = why

@@ -206,7 +206,7 @@ async def test_parameters_are_those_of_the_instant(recording: Path) -> None:
         await news(page, "timeline", lambda each: each["share"] == 1)
         await page.result("seek", time=T0 + 3 * S)
         (gain,) = await page.result("parameters", module="ROBOT")
-        assert (gain["name"], gain["value"], gain["unit"], gain["read_only"]) == ("gain", 0.0, "1/s", True)
+        assert (gain["name"], gain["value"], gain["unit"], gain["origin"]) == ("gain", 0.0, "1/s", "run time")
         await page.result("seek", time=T0 + 13 * S)
         assert (await page.result("parameters", module="ROBOT"))[0]["value"] == 1.0
         assert await page.result("parameters", module="OTHER") == []

@@ -72,8 +72,9 @@ MISS_KINDS = frozenset({"missed", "late", "overdue", "lost"})
 _HISTORY_BYTES = 8 << 20  # of the changes of modules, of parameters, and of slots, as they are in the file
 _SIZES_MAX = 1000  # channels whose size is found
 _NAMES_MAX = 1 << 14  # modules and topics whose last value is kept, to see what changes
-_GAP_MIN: Final = SECOND  # ns without a message after which a topic of a steady rate has a gap
+_GAP_MIN: Final = 2 * SECOND  # ns without a message after which a topic of a steady rate has a gap
 _GAP_PERIODS = 20  # ... and at least as many of its usual periods
+_GAP_PAUSES = 3  # ... and of its longest pause so far: messages may come in bursts
 _STEADY = 10  # messages from which the rate of a topic is known
 _OVERHEAD = 200  # bytes of a change, besides
 _TOLD_EVERY = 0.25  # s between two looks of those that follow the scan
@@ -216,6 +217,7 @@ class _TopicTimes:
         self._last: dict[str, int] = {}
         self._first: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
+        self._pauses: dict[str, int] = {}  # the longest ones that are no gaps (ns)
         self._silent: Counter[str] = Counter()  # ns of gaps, which are not counted for the rate
 
     def enter(self, channels: dict[int, BagChannel], times: dict[int, list[int]]) -> None:
@@ -242,12 +244,13 @@ class _TopicTimes:
 
     def _look(self, topic: str, before: int, after: int, first: int) -> None:
         silence, count = after - before, self._counts[topic]
-        if silence < _GAP_MIN or count < _STEADY:
+        period = (before - first - self._silent[topic]) / max(count, 1)
+        least = max(_GAP_MIN, _GAP_PERIODS * period, _GAP_PAUSES * self._pauses.get(topic, 0))
+        if silence < least or count < _STEADY:
+            self._pauses[topic] = max(silence, self._pauses.get(topic, 0))
             return
-        period = (before - first - self._silent[topic]) / count
-        if silence >= _GAP_PERIODS * period:
-            self._silent[topic] += silence
-            self._scan.keep(self._scan.gaps, (topic, before, after), GAPS_MAX, "gaps")
+        self._silent[topic] += silence
+        self._scan.keep(self._scan.gaps, (topic, before, after), GAPS_MAX, "gaps")
 
 
 class _Observed:

@@ -309,7 +309,7 @@ class RecordedSession(SourceSession):
                 "value": _value(each.value),
                 "unit": each.unit,
                 "origin": each.origin,
-                "read_only": True,
+                "choices": [each.value.strip('"')] if each.kind == "enum" else [],
             }
             for each in self._source.scan.parameters.at(cursor.time).values()
             if each.module == request.module and not each.gone
