@@ -42,7 +42,7 @@ export class EventList {
       h("div", { class: "timeline-tools" }, field("Kind", this.kind, { hidden: true }), filter, this.note,
         h("div", { class: "timeline-right" }, button("Close", () => this.#toggle(), { class: "quiet" }))),
       h("div", { class: "timeline-table", tabindex: 0, role: "region", "aria-label": "Table of events" },
-        h("table", {}, h("thead", {}, h("tr", {}, head)), this.body)),
+        h("table", { "aria-label": "Events" }, h("thead", {}, h("tr", {}, head)), this.body)),
     )
   }
 
