@@ -105,6 +105,10 @@ class RecordedFigures:
     async def at(self, time: int) -> NetworkSnapshot:
         """Return the figures at an instant (ns). Raises BagError if the recording can't be opened."""
         bag = await self._reader.bag()
+        with self._reader.ahead():
+            return await self._at(bag, time)
+
+    async def _at(self, bag: Bag, time: int) -> NetworkSnapshot:
         if self._static is None:
             self._static = await self._reader.run(lambda: _Contents(bag))
         static = self._static

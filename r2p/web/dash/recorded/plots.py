@@ -90,13 +90,14 @@ class RecordedPlot:
         steps = MinMaxSteps(len(self._paths), (start, end), self._points)
         self._due = asyncio.get_running_loop().time() + _FIRST_AFTER
         if len(chunks) > _FEW:
-            for number, chunk in itertools.islice(spread(chunks), self._points // 2):
-                await self._reader.run(partial(self._read, bag, table.ids[number], steps, number, chunk, _PREVIEW))
-                await self._send(steps, send)
+            with self._reader.ahead():
+                for number, chunk in itertools.islice(spread(chunks), self._points // 2):
+                    await self._reader.run(partial(self._read, bag, table.ids[number], steps, number, chunk, _PREVIEW))
+                    await self._send(steps, send)
             if steps.has_all:
                 steps = MinMaxSteps(len(self._paths), (start, end), self._points)
         for i, (number, chunk) in enumerate(chunks):
-            await self._reader.run(partial(self._read, bag, table.ids[number], steps, number, chunk, None))
+            await self._reader.run_behind(partial(self._read, bag, table.ids[number], steps, number, chunk, None))
             self._progress.share = i / len(chunks)
             await self._send(steps, send)
         self._progress.share = 1.0

@@ -5,6 +5,7 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -58,17 +59,23 @@ class RecordingReader:
 
     async def run(self, step: Callable[[], T]) -> T:
         """Run a function in the thread, after those that wait, and return its result."""
+        with self.ahead():
+            return await asyncio.get_running_loop().run_in_executor(self._thread, step)
+
+    @contextmanager
+    def ahead(self) -> Iterator[None]:
+        """Let nothing that is behind begin within the block, also between two steps."""
         self._waiting += 1
         self._idle.clear()
         try:
-            return await asyncio.get_running_loop().run_in_executor(self._thread, step)
+            yield
         finally:
             self._waiting -= 1
             if not self._waiting:
                 self._idle.set()
 
     async def run_behind(self, step: Callable[[], T]) -> T:
-        """Run a function in the thread as soon as nothing else waits for it."""
+        """Run a function in the thread when nothing waits for it that a user looks at, by turns with others."""
         await self._idle.wait()
         return await asyncio.get_running_loop().run_in_executor(self._thread, step)
 

@@ -8,7 +8,7 @@ import asyncio
 import itertools
 from bisect import bisect_right
 from collections import Counter, defaultdict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
@@ -76,6 +76,7 @@ _GAP_MIN: Final = 2 * SECOND  # ns without a message after which a topic of a st
 _GAP_PERIODS = 20  # ... and at least as many of its usual periods
 _GAP_PAUSES = 3  # ... and of its longest pause so far: messages may come in bursts
 _STEADY = 10  # messages from which the rate of a topic is known
+_BATCH_BYTES = 1 << 20  # of chunks that are read in one step
 _OVERHEAD = 200  # bytes of a change, besides
 _TOLD_EVERY = 0.25  # s between two looks of those that follow the scan
 
@@ -149,9 +150,11 @@ class RecordingScan:
         for channel in itertools.islice((each for each in bag.channels if each.kind == "samples"), _SIZES_MAX):
             await self._reader.run_behind(partial(self._enter_size, channel))
         self._notify()
-        for i, (number, chunk) in enumerate(table.chunks):
-            await self._reader.run_behind(partial(self._read, bag, number, chunk))
-            self.share = i / len(table.chunks)
+        done = 0
+        for chunks in _batches(table.chunks):
+            await self._reader.run_behind(partial(self._read_all, bag, chunks))
+            done += len(chunks)
+            self.share = min(done / len(table.chunks), 0.99)
             self._notify()
         self._observed.finish()
         self.share = 1.0
@@ -173,8 +176,12 @@ class RecordingScan:
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
 
+    def _read_all(self, bag: Bag, chunks: list[tuple[int, ChunkRef]]) -> None:
+        """Enter chunks, in the thread of the reader."""
+        for number, chunk in chunks:
+            self._read(bag, number, chunk)
+
     def _read(self, bag: Bag, number: int, chunk: ChunkRef) -> None:
-        """Enter a chunk, in the thread of the reader."""
         channels = bag.files[number].channels
         self._topics.enter(channels, self._reader.times(bag, number, chunk))
         wanted = frozenset(key for key, each in channels.items() if each.kind == "meta" or _is_observation(each))
@@ -199,6 +206,18 @@ class RecordingScan:
             kept.append(item)
         else:
             self.left_out[name] += 1
+
+
+def _batches(chunks: Iterable[tuple[int, ChunkRef]]) -> Iterator[list[tuple[int, ChunkRef]]]:
+    """Yield chunks, several small ones together: a plot that is read by turns with them takes as long for each turn."""
+    batch: list[tuple[int, ChunkRef]] = []
+    for each in chunks:
+        batch.append(each)
+        if sum(chunk.length for _, chunk in batch) >= _BATCH_BYTES:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
 
 
 def _is_observation(channel: BagChannel) -> bool:
