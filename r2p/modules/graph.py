@@ -32,6 +32,8 @@ from r2p.transports.link import Link
 from r2p.units import SECOND
 from r2p.version import __version__
 
+_CLASSES = tuple(PublisherClass(number or 1) for number in range(4))
+
 
 class Endpoint(msgspec.Struct, frozen=True, order=True):
     """A publisher (`publisher_class` is set) or a subscriber of a node. `link` is empty for one of this module."""
@@ -336,7 +338,7 @@ def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
             continue  # most likely an earlier start of that module, which a gateway has not forgotten yet
         view = views.setdefault(endpoint.topic, TopicView(endpoint.topic))
         publishes = endpoint.role == ROLE_PUBLISHES
-        klass = PublisherClass(endpoint.publisher_class & 3 or 1) if publishes else None  # a byte from outside
+        klass = _CLASSES[endpoint.publisher_class & 3] if publishes else None  # a byte from outside
         (view.publishers if publishes else view.subscribers).append(Endpoint(module, endpoint.node, klass, link.name))
 
 

@@ -8,7 +8,7 @@ file. `message_index` finds a few messages of a chunk without the others. `editi
 
 A `recorder` subscribes to topics (`topics`), and hands what they receive, as `entries`, to the thread of
 `background_writer`; `recording_files` decides where a file ends, and what a full disk costs. Its other parts are
-`frame_recorder` and `observations`, with `bus_watch`, `log_watch` and `module_watch`; `timeline` reads what these saw.
+`frame_recorder` and `observations`, with `bus_watch` and `module_watch`; `timeline` reads what these saw.
 `player` publishes what is in a bag, by each `played_publisher`, at the times that `pacing` keeps.
 
 CAN frames: `frames` says how they are written, `frame_reader` reads them, and `frame_player` plays them onto a bus. The

@@ -27,16 +27,16 @@ import tomli_w
 
 from r2p.errors import Closed
 from r2p.log_lines import get_logger
-from r2p.messages import Message
+from r2p.messages import Message, Timestamp
 from r2p.modules.graph import ModuleView, NetworkView
 from r2p.modules.module import Module
+from r2p.monitoring.log import LogEntry, LogFollower
 from r2p.monitoring.polling import can_be_asked
 from r2p.parameters.definition import ParameterInfo
 from r2p.protocols.discovery.events import Mismatched, ModuleChanged, ModuleGone, NameConflict
 from r2p.recording.bus_watch import BusWatch
 from r2p.recording.entries import AttachmentEntry, BagEntry, MessageEntry
-from r2p.recording.log_watch import LogWatch
-from r2p.recording.messages import EVENTS, SIGNALS, TEXT_MAX, RecordedEvent, RecordedSignal, cut
+from r2p.recording.messages import EVENTS, LOGS, SIGNALS, TEXT_MAX, LogRecord, RecordedEvent, RecordedSignal, cut
 from r2p.recording.module_watch import ModuleWatch, Parameters
 from r2p.runtime.events import LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
 from r2p.runtime.qos import PublisherSignal, SignalKind
@@ -49,6 +49,7 @@ SIGNALS_MAX = 1000
 _SETTLED = 3 * SECOND  # ns after which the network is known, and described in attachments
 _SETTLED_WITHOUT_ANSWERS = 10 * SECOND  # ns, the same if modules are silent
 _FIRMWARE_SILENT = 15.0  # s; it says ALIVE once in all its announcements, one of which it sends each half second
+_STAMP_MAX = ((1 << 32) - 1) * SECOND  # ns, the last one that a message can have
 _MODULES_MAX = 256  # modules that are asked: names come from the network, and channels of a file stay
 
 logger = get_logger("r2p.recording")
@@ -85,7 +86,9 @@ class Observations:
     async def __aenter__(self) -> Self:
         """Begin to observe. Raises Closed if the module is not open."""
         self._buses = BusWatch(self._module, self._record)
-        self._log = LogWatch(self._module, self._record)
+        self._log = LogFollower(self._module)
+        self._log.listeners.append(lambda entry: self._record(LOGS, log_record(entry)))
+        await self._log.__aenter__()
         self._events = self._module.events()
         self._module.space.signal_listeners.append(self._signals.write)
         self._begin()
@@ -101,7 +104,7 @@ class Observations:
         await asyncio.wait([self._task])
         self._signals.flush()
         self._buses.close()
-        self._log.close()
+        await self._log.__aexit__(None, None, None)
         self._describe()
 
     async def _run(self) -> None:
@@ -171,7 +174,6 @@ class Observations:
                 self._note_silent_firmware()
                 self._watch_modules(tasks)
                 self._buses.look()
-                self._log.look(tasks)
             except Closed:
                 return
             if self._is_known():
@@ -225,6 +227,13 @@ class Observations:
 
     def _attach(self, name: str, media_type: str, data: bytes) -> None:
         self._add(AttachmentEntry(name, media_type, data, self._clock.now()))
+
+
+def log_record(entry: LogEntry) -> LogRecord:
+    """Return a log record as it is recorded: as those of ROS, which Foxglove and rqt show as a log."""
+    name = "/".join(filter(None, (entry.module, entry.node)))
+    stamp = Timestamp.from_ns(min(max(entry.stamp, 0), _STAMP_MAX))
+    return LogRecord(stamp=stamp, level=entry.level, name=cut(name), msg=cut(entry.text, TEXT_MAX))
 
 
 def event_message(event: ModuleEvent) -> RecordedEvent:

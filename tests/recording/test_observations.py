@@ -21,6 +21,7 @@ import r2p.sim
 from r2p.clock import clock_of
 from r2p.messages import Message
 from r2p.modules.statistics import ModuleStatistics, PublisherStatistics, ReasonCount
+from r2p.monitoring.log import LogEntry
 from r2p.msg import BusTraffic, Led
 from r2p.parameters.sources import read_file
 from r2p.recording.entries import AttachmentEntry, BagEntry, MessageEntry
@@ -36,7 +37,7 @@ from r2p.recording.messages import (
     SlotTable,
 )
 from r2p.recording.module_watch import growth
-from r2p.recording.observations import SIGNALS_MAX, Observations
+from r2p.recording.observations import SIGNALS_MAX, Observations, log_record
 from r2p.recording.timeline import slots_at, timeline
 from r2p.sim.robots.emulated import Triskar2
 from r2p.sim.transport import SimPort
@@ -82,6 +83,11 @@ async def observed(module: r2p.Module) -> AsyncIterator[Recorded]:
     recorded = Recorded()
     async with Observations(module, recorded.entries.append, {"r2p.toml": ("application/toml", b"format = 1\n")}):
         yield recorded
+
+
+@pytest.mark.parametrize("stamp", [-1, 0, 1 << 80])
+def test_any_stamp_of_a_log_record_is_recorded(stamp: int) -> None:
+    assert log_record(LogEntry(stamp, 20, "robot1/ARM", "wrist", "ready")).name == "robot1/ARM/wrist"
 
 
 async def test_the_master_dies_its_slots_are_lost_and_another_is_elected() -> None:
