@@ -22,6 +22,7 @@ ALL = (
     "recording",
     "recording_edit",
     "monitoring",
+    "top",
     "rtcan",
     "timers",
     "playing",

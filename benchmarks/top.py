@@ -1,6 +1,5 @@
 """The share of a core that `r2p top` takes, the whole process, with 1 000 topics at a terminal of 80 by 24."""
 
-import asyncio
 import fcntl
 import os
 import pty
@@ -10,47 +9,16 @@ import termios
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager
-from multiprocessing.connection import Connection
+from contextlib import contextmanager
 
-import r2p
 from benchmarks import zenoh
-from benchmarks.loops import run_on
+from benchmarks.monitoring import MODULES, TOPICS, run_robot
 from benchmarks.processes import process
 from benchmarks.table import Row
-from r2p.msg import Led
 
-MODULES, TOPICS = 20, 50  # of each module
-PERIOD = 1.0  # s, of each topic
 STARTING, SETTLING, SECONDS = 60.0, 25.0, 20.0
 GOAL = 0.05
 _TICKS = os.sysconf("SC_CLK_TCK")  # a second
-
-
-async def _publish(node: r2p.Node) -> None:
-    """Publish all topics of a module, one after the other; another node of it subscribes."""
-    publishers = [node.advertise(f"{node.module.lower()}/topic{number}", Led) for number in range(TOPICS)]
-    for publisher in publishers:
-        node.subscribe(publisher.topic, Led, queue=1, lossy=True)
-    async for _ in node.every(PERIOD / TOPICS):
-        await publishers[0].publish(Led())
-        publishers.append(publishers.pop(0))
-
-
-async def _robot(pipe: Connection) -> None:
-    """Run a router, and the modules."""
-    async with AsyncExitStack() as stack:
-        router = r2p.Module("ROUTER", via=zenoh.LISTEN.replace("peer", "router"), watchdog=False)
-        port = zenoh.port_of(await stack.enter_async_context(router))
-        for number in range(MODULES):
-            module = r2p.Module(f"MODULE{number}", via=zenoh.connect(port), watchdog=False)
-            (await stack.enter_async_context(module)).start(_publish)
-        pipe.send(port)
-        await asyncio.get_running_loop().create_future()
-
-
-def _process(pipe: Connection) -> None:
-    run_on("uvloop", _robot(pipe))
 
 
 class _Terminal:
@@ -102,7 +70,7 @@ def _top(port: int) -> Iterator[_Terminal]:
 
 
 def rows() -> Iterator[Row]:
-    with process(_process) as pipe, _top(pipe.recv()) as terminal:
+    with process(run_robot) as pipe, _top(pipe.recv()) as terminal:
         shown = terminal.wait_for(b"1000 topics") or terminal.wait_for(b"1001 topics")
         time.sleep(SETTLING)
         began, used, written = time.perf_counter(), terminal.cpu(), len(terminal.written)

@@ -138,6 +138,7 @@ class TablesScreen(Screen[None]):
         self._details = details
         self._snapshot = self._newest = details.monitor.snapshot
         self._sorting = {view.name: (sorted_by or view.columns[0].name, False)}
+        self._rows: dict[str, list[Any]] = {}
         self._losses = RecentLosses()
         self._bus = 0
 
@@ -168,13 +169,23 @@ class TablesScreen(Screen[None]):
         self._newest = snapshot
         self._losses.note(snapshot)
         if not self.paused:
-            self._snapshot = snapshot
+            self._take(snapshot)
             if self.is_mounted:
                 self._draw()
 
+    def _rows_of(self, name: str) -> list[Any]:
+        """Return the rows of a table; they are put together once for each snapshot."""
+        if name not in self._rows:
+            self._rows[name] = VIEWS[name].rows(self._snapshot)
+        return self._rows[name]
+
+    def _take(self, snapshot: NetworkSnapshot) -> None:
+        self._snapshot = snapshot
+        self._rows.clear()
+
     def rows(self) -> list[Any]:
         """Return the rows of the table, filtered and sorted."""
-        rows = self.view.rows(self._snapshot)
+        rows = self._rows_of(self.view.name)
         if self.view.name == "buses":
             bus = self._shown_bus()
             rows = [row for row in rows if row.bus is bus]
@@ -208,8 +219,8 @@ class TablesScreen(Screen[None]):
             text.append("PAUSED  ", style="bold yellow")
         text.append(printable(snapshot.network or self._details.session.network_name), style="not bold cyan")
         parts = [
-            _how_many(len(VIEWS["modules"].rows(snapshot)), "module"),
-            _how_many(len(TOPICS.rows(snapshot)), "topic"),
+            _how_many(len(self._rows_of("modules")), "module"),
+            _how_many(len(self._rows_of("topics")), "topic"),
             f"  {drawing.number(sum(rates) if rates else None)} messages/s",
             *(printable(f"  {bus.name} {drawing.percent(bus.share)} %") for bus in snapshot.buses),
         ]
@@ -219,7 +230,7 @@ class TablesScreen(Screen[None]):
         text = Text()
         for i, name in enumerate(VIEWS, start=1):
             text.append(f"{i} {name}", style="reverse" if name == self.view.name else "").append("  ")
-        total = len(self.view.rows(self._snapshot))
+        total = len(self._rows_of(self.view.name))
         if self.wanted:
             text.append(printable(f"{count} of {total} with {self.wanted!r}"), style="bold yellow")
         else:
@@ -299,7 +310,7 @@ class TablesScreen(Screen[None]):
         """Freeze what is shown, or show the newest figures again."""
         self.paused = not self.paused
         if not self.paused:
-            self._snapshot = self._newest
+            self._take(self._newest)
         self._draw()
 
     def action_measure(self) -> None:

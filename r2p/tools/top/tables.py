@@ -5,6 +5,7 @@ returns a value, which sorts and which JSON and CSV have (seconds, bytes, shares
 """
 
 from collections.abc import Callable, Iterable
+from operator import itemgetter
 from typing import Any
 
 import msgspec
@@ -97,11 +98,11 @@ class BusRow(msgspec.Struct, frozen=True):
 
 def sort(rows: Iterable[Any], column: Column, *, reverse: bool = False) -> list[Any]:
     """Return rows by a column, the largest number or the first text first; unknown values are last either way."""
-    known = [(value, row) for row in rows if (value := column.value(row)) is not None]
-    unknown = [row for row in rows if column.value(row) is None]
+    pairs = [(column.value(row), row) for row in rows]
+    known = [pair for pair in pairs if pair[0] is not None]
     descending = not column.is_text
-    known.sort(key=lambda pair: pair[0], reverse=descending != reverse)
-    return [row for _, row in known] + unknown
+    known.sort(key=itemgetter(0), reverse=descending != reverse)
+    return [row for _, row in known] + [row for value, row in pairs if value is None]
 
 
 def matching(view: View, rows: list[Any], wanted: str) -> list[Any]:
@@ -144,13 +145,13 @@ class RecentLosses:
     """Notes which topics have lost something of late: what a robot lost at its start must not be red for ever."""
 
     def __init__(self) -> None:
-        self._lost: dict[str, _Losses] = {}
+        self._rows: dict[str, TopicFigures] = {}
         self._until: dict[str, int] = {}  # ns
 
     def note(self, snapshot: NetworkSnapshot) -> None:
         """Compare the losses of all topics with those of the last snapshot, as far as they were known then."""
-        before, self._lost = self._lost, {row.name: _losses(row) for row in snapshot.topics}
-        grown = [name for name, now in self._lost.items() if _has_grown(before.get(name, now), now)]
+        before, self._rows = self._rows, {row.name: row for row in snapshot.topics}
+        grown = [name for name, row in self._rows.items() if _has_lost_more(before.get(name, row), row)]
         self._until = {name: end for name, end in self._until.items() if end > snapshot.time}
         self._until |= dict.fromkeys(grown, snapshot.time + _RECENT)
 
@@ -159,9 +160,11 @@ class RecentLosses:
         return ALARM if row.name in self._until else TOPICS.alarm(row)
 
 
-def _has_grown(before: _Losses, now: _Losses) -> bool:
-    pairs = zip(before, now, strict=True)
-    return now != before and any(old is not None and new is not None and new > old for old, new in pairs)
+def _has_lost_more(before: TopicFigures, row: TopicFigures) -> bool:
+    if before is row:  # as most of them are: a row that has not changed is the same object
+        return False
+    pairs = zip(_losses(before), _losses(row), strict=True)
+    return any(old is not None and new is not None and new > old for old, new in pairs)
 
 
 def _topics(snapshot: NetworkSnapshot) -> list[TopicFigures]:
