@@ -11,7 +11,7 @@ from collections import Counter
 from types import TracebackType
 from typing import Self
 
-from r2p.clock import sleep_in_background
+from r2p.clock import real_time, sleep_in_background
 from r2p.errors import Closed
 from r2p.log_lines import get_logger
 from r2p.modules.module import Module
@@ -64,9 +64,10 @@ class FoxgloveServer:
         self.network = FoxgloveNetwork(self._module, self._options, changes, self.refused)
         clock = self._module.space.clock
         self._session_id = str(clock.now() // MILLISECOND)
-        self._tasks = [asyncio.create_task(self._watch(), name="foxglove watches the network")]
-        if clock.virtual:
-            self._tasks.append(asyncio.create_task(self._send_times(), name="foxglove sends the time"))
+        with real_time():  # clients live in it, also while the time of a simulation stands still
+            self._tasks = [asyncio.create_task(self._watch(), name="foxglove watches the network")]
+            if clock.virtual:
+                self._tasks.append(asyncio.create_task(self._send_times(), name="foxglove sends the time"))
         return self
 
     async def __aexit__(
