@@ -47,8 +47,10 @@ ELSEWHERE = {
 }
 """(File, key): what the key may be."""
 
-_SKIPPED = ("sim", "tools", "recording")
-"""What is emulated has losses of its own; tools count only for their output, and recordings by topic: see there."""
+_SKIPPED = ("sim", "tools", "recording", "monitoring", "web")
+"""What is emulated has losses of its own; tools, pages and viewers count only for their output; recordings and monitors
+by topic: see there.
+"""
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
