@@ -1,21 +1,26 @@
 // Chooses the fields of a plot: all topics, searched by words, and what of their messages can be plotted.
 
 import { openDialog } from "./dialogs.js"
-import { button, h, setText } from "./dom.js"
+import { button, h, oncePerFrame, setText } from "./dom.js"
 import { plural } from "./format.js"
 
 const DESCRIBED_AT_ONCE = 40 // topics whose types are asked for without a click
 const SHOWN = 120 // topics
+const OPEN = 4 // topics of a small network, whose fields are listed at once
 const ELEMENTS = 16 // of an array that are listed; others are typed: scan.ranges[57]
 
 // What can be plotted of each topic, asked once.
 export class FieldCatalog {
   #connection
   #known = new Map()
+  #asked = new Map()
 
   constructor(connection) {
     this.#connection = connection
-    connection.addEventListener("hello", () => this.#known.clear())
+    connection.addEventListener("hello", () => {
+      this.#known.clear()
+      this.#asked.clear()
+    })
   }
 
   known(topic) {
@@ -23,22 +28,30 @@ export class FieldCatalog {
   }
 
   // Return {fields: [names]} or {error}, when it is known.
-  async describe(topic) {
-    if (!this.#known.has(topic)) {
-      this.#known.set(topic, {})
-      try {
-        const { fields } = await this.#connection.request("describe", { topic })
-        this.#known.set(topic, { fields: fields.filter(each => each.plottable).flatMap(each => names(topic, each)) })
-      } catch (error) {
-        this.#known.set(topic, { error: error.message })
-      }
-    }
-    return this.#known.get(topic)
+  describe(topic) {
+    if (!this.#asked.has(topic)) this.#asked.set(topic, this.#ask(topic))
+    return this.#asked.get(topic)
   }
 
   // What failed may be known by now.
   forgetErrors() {
-    for (const [topic, { error }] of this.#known) if (error !== undefined) this.#known.delete(topic)
+    for (const [topic, { error }] of this.#known) {
+      if (error === undefined) continue
+      this.#known.delete(topic)
+      this.#asked.delete(topic)
+    }
+  }
+
+  async #ask(topic) {
+    let known
+    try {
+      const { fields } = await this.#connection.request("describe", { topic })
+      known = { fields: fields.filter(each => each.plottable).flatMap(each => names(topic, each)) }
+    } catch (error) {
+      known = { error: error.message }
+    }
+    this.#known.set(topic, known)
+    return known
   }
 }
 
@@ -64,6 +77,7 @@ class FieldPicker {
   #open = new Set()
   #list = h("div", { class: "picker-list" })
   #found = h("p", { class: "dim", role: "status" })
+  #drawSoon = oncePerFrame(() => this.#draw())
 
   constructor(app, catalog, chosen, toggle) {
     this.#app = app
@@ -110,12 +124,11 @@ class FieldPicker {
   }
 
   // In a small network all fields are searched; in a large one those of the topics that match.
-  async #describeFirst() {
-    const text = this.#text
+  #describeFirst() {
     const all = [...this.#app.store.topics.keys()]
     const topics = (all.length <= DESCRIBED_AT_ONCE ? all : this.#words.length ? this.#topics() : [])
       .filter(topic => !this.#catalog.known(topic)).slice(0, DESCRIBED_AT_ONCE)
-    await Promise.all(topics.map(topic => this.#catalog.describe(topic).then(() => this.#text === text && this.#draw())))
+    for (const topic of topics) this.#catalog.describe(topic).then(this.#drawSoon)
   }
 
   #draw() {
@@ -142,7 +155,7 @@ class FieldPicker {
 
   #topic(topic) {
     const details = h("details", {}, h("summary", {}, topic), h("div", { class: "picker-fields" }))
-    details.open = this.#open.has(topic) || this.#words.length > 0
+    details.open = this.#open.has(topic) || this.#words.length > 0 || this.#app.store.topics.size <= OPEN
     if (details.open) this.#fill(details, topic)
     details.addEventListener("toggle", () => {
       if (!this.#words.length && details.open) this.#open.add(topic)
@@ -154,12 +167,8 @@ class FieldPicker {
 
   async #fill(details, topic) {
     const box = details.lastElementChild
-    const known = this.#catalog.known(topic)
-    if (!known?.fields && !known?.error) {
-      box.replaceChildren(h("p", { class: "dim" }, "asking for its type"))
-      await this.#catalog.describe(topic)
-    }
-    const { error, fields = [] } = this.#catalog.known(topic) ?? {}
+    if (!this.#catalog.known(topic)) box.replaceChildren(h("p", { class: "dim" }, "asking for its type"))
+    const { error, fields = [] } = await this.#catalog.describe(topic)
     const shown = this.#words.length ? this.#fieldsOf(topic) : fields
     box.replaceChildren(...(error ? [h("p", { class: "dim" }, error)] : shown.map(field => this.#choice(field))))
     if (!error && !shown.length) box.append(h("p", { class: "dim" }, "nothing in it is a number"))

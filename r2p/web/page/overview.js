@@ -122,7 +122,7 @@ class OverviewView {
   #paused = false
   #tables = new Map()
   #buses = new Map()
-  #busBox = h("div", { class: "buses" })
+  #busBox = h("div", { class: "bus-cards" })
   #totals = new Map()
   #counts = new Map()
   #ofServices

@@ -39,6 +39,7 @@ class PlotsView {
   #labelled = 0
   #cursor = null
   #whole = null // of a recording: {start, end}
+  #fits = true // the window is all of the recording
   #settling = 0
   #list = h("div", { class: "plot-list fill" })
   #span = h("p", { class: "dim nowrap mono" })
@@ -58,6 +59,9 @@ class PlotsView {
     this.#window.addEventListener("change", () => this.#windowChanged())
     this.#streams.addEventListener("points", event => this.#heard(event.detail))
     app.connection.addEventListener("clock", event => this.#mark(event.detail.time / 1e9))
+    app.connection.addEventListener("hello", event => {
+      this.#pause.hidden = event.detail.recording
+    })
     document.addEventListener("theme", () => this.#plots.forEach(plot => plot.recolor()))
     this.#nameWidths()
   }
@@ -186,7 +190,7 @@ class PlotsView {
   }
 
   #reset() {
-    if (this.#whole) this.#window.show(this.#whole.start, this.#whole.end)
+    if (this.#whole) this.#fit()
     else this.#window.follow()
   }
 
@@ -199,8 +203,9 @@ class PlotsView {
     const { live } = this.#window
     this.#pause.setAttribute("aria-pressed", !live)
     setText(this.#pause, live ? "Pause" : "Resume")
-    this.#pause.hidden = this.#app.hello?.recording ?? false
     this.#nameWidths()
+    const range = this.#window.range()
+    this.#fits = this.#whole === null || range.end === this.#whole.end && this.#window.width === range.end - this.#whole.start
     if (this.#app.hello?.recording) this.#look()
   }
 
@@ -213,11 +218,10 @@ class PlotsView {
 
   // A recording is asked for what is shown, once the window rests.
   #look() {
-    if (!this.#whole) return
     clearTimeout(this.#settling)
     this.#settling = setTimeout(() => {
-      const { start, end } = this.#window.range()
-      this.#streams.look({ start, end, points: 2 * Math.max(500, this.#list.clientWidth) })
+      const part = this.#fits || !this.#whole ? {} : this.#window.range()
+      this.#streams.look({ ...part, points: 2 * Math.max(500, this.#list.clientWidth) })
     }, SETTLED)
   }
 
@@ -226,10 +230,21 @@ class PlotsView {
     if (!numbers) return
     const points = this.#streams.all().filter(series => series.length)
     if (!this.#app.hello?.recording) return this.#window.heard(Math.max(...points.map(series => series.last)))
-    if (this.#whole) return
-    const whole = { start: Math.min(...points.map(series => series.times[0])), end: Math.max(...points.map(series => series.last)) }
-    this.#whole = whole
-    this.#window.show(whole.start, whole.end)
+    return this.#learnWhole(points)
+  }
+
+  // The first points of a recording are coarse: more of them may begin earlier and end later.
+  #learnWhole(points) {
+    const { start, end } = this.#whole ?? { start: Infinity, end: -Infinity }
+    const first = Math.min(start, ...points.map(series => series.times[0]))
+    const last = Math.max(end, ...points.map(series => series.last))
+    if (first === start && last === end) return
+    this.#whole = { start: first, end: last }
+    if (this.#fits) this.#fit()
+  }
+
+  #fit() {
+    this.#window.show(this.#whole.start, this.#whole.end)
   }
 
   #mark(time) {

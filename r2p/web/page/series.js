@@ -76,12 +76,13 @@ export class Series {
   }
 
   #reserve(size) {
-    if (this.length + size <= this.times.length) return
-    if (this.times.length < 2 * POINTS_MAX) return this.#grow(this.length + size)
+    if (this.length + size <= this.times.length) return undefined
+    if (this.length + size <= 2 * POINTS_MAX) return this.#grow(this.length + size)
     const gone = this.length - POINTS_MAX + size
     for (const array of [this.times, ...this.columns.values()]) array.copyWithin(0, gone, this.length)
     this.length -= gone
     this.dropped += gone
+    return undefined
   }
 
   #grow(needed) {

@@ -104,7 +104,7 @@ class TopicStream {
   }
 
   #take(fields, times, columns, overlap) {
-    if (this.#recording) this.series.replace(fields, times, columns)
+    if (this.#recording()) this.series.replace(fields, times, columns)
     else this.series.append(fields, times, columns, { overlap })
     this.#changed(times.length * columns.length)
   }
@@ -161,7 +161,7 @@ export class Streams extends EventTarget {
   }
 
   #create() {
-    return new TopicStream(this.#app.connection, this.#app.hello?.recording ?? false,
+    return new TopicStream(this.#app.connection, () => this.#app.hello?.recording,
       (numbers = 0) => this.dispatchEvent(new CustomEvent("points", { detail: numbers })))
   }
 

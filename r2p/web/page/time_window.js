@@ -26,7 +26,7 @@ export class TimeWindow extends EventTarget {
 
   show(start, end) {
     this.width = Math.min(WIDTH_MAX, Math.max(WIDTH_MIN, end - start))
-    this.end = (start + end) / 2 + this.width / 2
+    this.end = this.width === end - start ? end : (start + end) / 2 + this.width / 2
     this.live = false
     this.#change()
   }
