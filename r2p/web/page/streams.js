@@ -2,6 +2,8 @@
 
 import { Series } from "./series.js"
 
+const RETRY = 5_000 // ms
+
 let numbers = 0
 
 export function topicOf(name) {
@@ -165,13 +167,17 @@ export class Streams extends EventTarget {
       (numbers = 0) => this.dispatchEvent(new CustomEvent("points", { detail: numbers })))
   }
 
-  // What could not be plotted is tried again when the topic has got a type or a publisher.
+  // What could not be plotted is tried again when the topic has got a type or a publisher; a topic of which nothing
+  // could be plotted also after a while, as its module may only have been slow to answer.
   #retry() {
     for (const [topic, stream] of this.#topics) {
       const row = this.#app.store.topics.get(topic)
       const state = `${row?.type} ${row?.publishers?.length}`
-      if (stream.errors.size && this.#tried.get(topic) !== state && this.#tried.has(topic)) stream.renew()
-      this.#tried.set(topic, state)
+      const before = this.#tried.get(topic) ?? { state, time: performance.now() }
+      const isDue = stream.errors.size === stream.users.size && performance.now() - before.time > RETRY
+      const isNews = before.state !== state
+      if (stream.errors.size && (isDue || isNews)) stream.renew()
+      this.#tried.set(topic, isDue || isNews ? { state, time: performance.now() } : before)
     }
   }
 }

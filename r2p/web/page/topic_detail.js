@@ -20,6 +20,7 @@ export class TopicDetail {
   #fields = h("table", { class: "fields" })
   #rows = new Map()
   #row = undefined
+  #failed = false
   #watch = () => this.#ask()
   #take = event => event.detail.topic === this.name && this.#show(event.detail)
 
@@ -41,6 +42,7 @@ export class TopicDetail {
     const topic = this.#app.store.topics.get(this.name)
     if (topic === this.#row) return
     this.#row = topic
+    if (this.#failed) this.#ask() // its type may be known now
     if (!topic) return this.#facts.update([["State", "gone: nobody publishes or subscribes", "warn"]])
     this.#facts.update(figures(topic))
     this.#offer(topic)
@@ -64,9 +66,11 @@ export class TopicDetail {
   }
 
   async #ask() {
+    this.#failed = false
     try {
       await this.#app.connection.request("watch", { topic: this.name })
     } catch (error) {
+      this.#failed = true
       setText(this.#message, error.message)
     }
   }
