@@ -18,7 +18,7 @@ VALUES = "[...document.querySelectorAll('.legend .value')].map(each => each.text
 
 RESTS = """(() => {
     if (window.seen?.redraws !== r2p.stats.redraws) window.seen = { ...r2p.stats }
-    return r2p.stats.points > window.seen.points + 20
+    return r2p.stats.points > window.seen.points + 3
 })()"""
 
 THINNED = """async () => {
