@@ -16,7 +16,7 @@ from r2p.msg import Led
 
 MODULES, TOPICS = 20, 50  # of each module
 PERIOD = 1.0  # s, of each topic and of the monitor
-SETTLING, SECONDS = 8.0, 20.0
+SETTLING, SECONDS = 8.0, 15.0
 GOAL = 0.03  # of a core: that leaves room for a screen within the 5 % of `r2p top`
 
 
