@@ -7,7 +7,7 @@ STAMP := .venv/stamp
 LOWEST := .venv-lowest
 PYTHONS := 3.12 3.13
 
-.PHONY: demo test test-lowest test-pythons lint bench soak docs docs-check pictures clean
+.PHONY: demo test test-lowest test-pythons lint bench soak docs docs-check pictures page-pictures clean
 
 demo: $(RUN)
 	$(BIN)/r2p demo
@@ -65,6 +65,10 @@ pictures: $(STAMP)
 	$(BIN)/python docs/draw_architecture.py
 	$(BIN)/python docs/draw_diagrams.py
 	$(BIN)/python docs/draw_screens.py
+
+# The page of `r2p dash`, in a browser (make test PEERS=1 gets that): figures differ from run to run, so no test compares.
+page-pictures: $(STAMP)
+	$(BIN)/python -m docs.draw_pages
 
 clean:
 	rm -rf .venv .venv-* site

@@ -28,10 +28,11 @@ _QUALITY = 82  # of WebP, in percent
 
 
 class View(NamedTuple):
-    """A view in a window, after these seconds, and a condition in JavaScript."""
+    """A view in a window, these seconds after a condition in JavaScript is true."""
 
     address: str
     seconds: float = 2.0
+    shown: str = "r2p.store.topics.has('odometry')"
     size: str = "desktop"
     scheme: Literal["light", "dark"] = "light"
 
@@ -39,13 +40,11 @@ class View(NamedTuple):
 VIEWS = {
     "overview": View("overview"),
     "overview-phone": View("overview", size="phone", scheme="dark"),
-    "plots": View("plots/odometry.pose.x,odometry.pose.y", 20.0),
+    "plots": View("plots/speed.value[0],encoder1.delta", 12.0),
     "graph": View("graph"),
-    "slots": View("slots", 4.0),
+    "slots": View("slots", 4.0, "document.querySelector('.slots .slot.owned')"),
     "map": View("map", 20.0),
-    "log": View("log"),
-    "parameters": View("parameters/MOTOR1"),
-    "publish": View("publish/leds"),
+    "parameters": View("parameters/ki", 1.0, "document.querySelector('[data-parameter=ki]')"),
 }
 
 
@@ -72,7 +71,7 @@ async def _draw(opened: Browser, url: str, name: str) -> int:
     )
     tab = Tab(await context.new_page(), url)
     await tab.page.goto(f"{url}#/{view.address}")
-    await tab.until("r2p.store.topics.has('odometry')")
+    await tab.until(view.shown)
     await asyncio.sleep(view.seconds)
     session = await context.new_cdp_session(tab.page)
     shot = await session.send("Page.captureScreenshot", {"format": "webp", "quality": _QUALITY})
@@ -87,8 +86,9 @@ async def _draw_all(program: Path, names: list[str]) -> None:
     with _robot() as via:
         async with serve(via, publish=True, control=True) as dash, browser(program) as opened:
             await asyncio.sleep(_SETTLED)
-            sizes = await asyncio.gather(*(_draw(opened, dash.server.url, name) for name in names))
-    sys.stdout.writelines(f"{name}: {size / 1000:.0f} kB\n" for name, size in zip(names, sizes, strict=True))
+            for name in names:
+                size = await _draw(opened, dash.server.url, name)
+                sys.stdout.write(f"{name}: {size / 1000:.0f} kB\n")
 
 
 def main() -> None:

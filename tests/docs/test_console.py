@@ -21,7 +21,7 @@ from tests.docs.blocks import ROOT, Block, of_page, pages, pattern
 from tests.docs.shell import Command, Process, commands
 from tests.ports import free_port
 
-PORTS = ("2323", "2324", "2325", "2326", "8765")
+PORTS = ("2323", "2324", "2325", "2326", "8080", "8765")
 ROBOT = "192.168.0.10:23"
 DEVICE = "/dev/ttyUSB0"
 

@@ -40,5 +40,5 @@ def test_a_picture_stands_alone(file: Path) -> None:
 
 def test_each_picture_is_on_a_page() -> None:
     text = "\n".join(page.read_text(encoding="utf-8") for page in [*pages(), ROOT / "mkdocs.yml"])
-    assets = (ROOT / "docs" / "assets").rglob("*.svg")
+    assets = [*(ROOT / "docs" / "assets").rglob("*.svg"), *(ROOT / "docs" / "assets").rglob("*.webp")]
     assert [file.name for file in assets if file.relative_to(ROOT / "docs").as_posix() not in text] == []
