@@ -13,6 +13,7 @@ const SCALE_MIN = 1e-4
 const SCALE_MAX = 1e5
 const SIZE_MIN = 0.5 // m that a fitted map shows at least
 const ROBOT = 11 // px
+const AGAIN = 5_000 // ms, after which a topic that could not be described is asked for again
 const STREAMS = 0x8000 // the first one of maps; plots number theirs from 0
 
 export const map = {
@@ -35,6 +36,7 @@ class MapView {
   #none = h("p", { class: "empty" })
   #panZoom
   #isShown = false
+  #now = undefined // s, the time of a recording; of a network the newest pose counts
   #nextStream = STREAMS
   #draw = oncePerFrame(() => this.#isShown && this.#paint())
   #look = () => this.#findTopics()
@@ -49,6 +51,10 @@ class MapView {
     new ResizeObserver(this.#draw).observe(this.#canvas)
     document.addEventListener("theme", this.#draw)
     app.connection.addEventListener("hello", () => this.#begin())
+    app.connection.addEventListener("clock", event => {
+      this.#now = event.detail.time / 1e9
+      this.#draw()
+    })
   }
 
   show(argument) {
@@ -107,6 +113,7 @@ class MapView {
   // After another hello the process knows nothing of what this page has asked for.
   #begin() {
     this.#asked.clear()
+    this.#now = undefined
     for (const topic of this.#topics.values()) {
       if (topic.stream) topic.stream = null
       topic.trail.clear()
@@ -120,7 +127,9 @@ class MapView {
       const key = `${topic.name} ${topic.type ?? ""}`
       if (this.#asked.has(key) || topic.is_of_service || !mayHavePose(topic)) continue
       this.#asked.add(key)
-      this.#add(topic.name, { plot: this.#topics.size < SHOWN_MAX, quiet: true })
+      this.#add(topic.name, { plot: this.#topics.size < SHOWN_MAX, quiet: true }).then(isDescribed => {
+        if (!isDescribed) setTimeout(() => this.#asked.delete(key), AGAIN)
+      })
     }
     setText(this.#none, this.#topics.size ? "" : "No topic with a pose is known yet. Odometry, Pose and ROS's "
       + "nav_msgs/Odometry, PoseStamped and TransformStamped are found by their type.")
@@ -137,15 +146,18 @@ class MapView {
     const dialog = openDialog({ title: "Show another topic", body: field("Topic", choice), actions: [add] })
   }
 
+  // Show a topic, if it has a pose; return whether its type is known.
   async #add(name, { plot, quiet = false }) {
     const known = this.#topics.get(name)
-    if (known) return plot && this.#check(known, true)
+    if (known && plot) this.#check(known, true)
+    if (known) return true
     const wanted = this.#app.connection.request("describe", { topic: name })
     const description = await (quiet ? wanted.catch(() => null) : attempt(wanted))
-    if (!description || this.#topics.has(name)) return
+    if (!description || this.#topics.has(name)) return Boolean(description)
     const pose = poseOf(description)
     if (pose) this.#place({ name, reader: readerOf(pose), trail: new Trail(), stream: null }, plot)
     else if (!quiet) toast(`${name} has no pose: its type has no fields x and y of a position`, "bad")
+    return true
   }
 
   #place(topic, plot) {
@@ -224,7 +236,7 @@ class MapView {
 
   #adjust(trails) {
     if (this.#follow) {
-      const last = trails.find(({ topic }) => topic.trail.last)?.topic.trail.last
+      const last = trails.find(trail => trail.last)?.last
       if (last) Object.assign(this.#view, { x: last.x, y: last.y })
     } else if (this.#fitted) this.#fitTo(boundsOf(trails.flatMap(({ points }) => points)))
   }
@@ -241,8 +253,10 @@ class MapView {
   }
 
   #paint() {
+    const now = this.#app.hello?.recording ? this.#now ?? this.#app.store.time / 1e9 : undefined
     const trails = [...this.#topics.values()].filter(topic => topic.box.checked)
-      .map(topic => ({ topic, points: topic.trail.since(this.#seconds) }))
+      .map(topic => ({ topic, points: topic.trail.since(this.#seconds, now) }))
+      .map(({ topic, points }) => ({ topic, points, last: points.at(-1) }))
     this.#adjust(trails)
     const { width, height } = this.#size()
     const ratio = window.devicePixelRatio || 1
@@ -257,8 +271,8 @@ class MapView {
       width / 2 + (x - this.#view.x) * this.#view.scale, height / 2 - (y - this.#view.y) * this.#view.scale,
     ]
     this.#paintGrid(pen, width, height, place)
-    for (const { topic: { trail, colour }, points } of trails) {
-      paintTrail(pen, points, trail.last, color(`--series-${colour}`), place)
+    for (const { topic, points, last } of trails) {
+      paintTrail(pen, points, last, color(`--series-${topic.colour}`), place)
     }
     this.#write(trails)
   }
@@ -311,16 +325,13 @@ class MapView {
 
   // The table says the same as the picture.
   #write(trails) {
-    for (const { topic, points } of trails) {
-      const { last } = topic.trail
+    for (const { topic, points, last } of trails) {
       const degrees = last?.heading === null || !last ? UNKNOWN : fixed(last.heading * 180 / Math.PI)
       const texts = [fixed(last?.x, 3), fixed(last?.y, 3), degrees, String(points.length)]
       topic.cells.forEach((cell, index) => setText(cell, texts[index]))
     }
-    const said = trails.filter(({ topic }) => topic.trail.last).map(({ topic }) => {
-      const { x, y } = topic.trail.last
-      return `${topic.name} at ${fixed(x, 2)} m, ${fixed(y, 2)} m`
-    })
+    const said = trails.filter(({ last }) => last).map(({ topic, last: { x, y } }) => (
+      `${topic.name} at ${fixed(x, 2)} m, ${fixed(y, 2)} m`))
     this.#canvas.setAttribute("aria-label", `Map: ${said.join("; ") || "no poses yet"}. The table has the figures.`)
     Object.assign(this.#canvas.dataset, { points: trails.reduce((sum, { points }) => sum + points.length, 0) })
   }

@@ -72,18 +72,22 @@ export class Trail {
     if (this.points.length > 2 * Trail.#MAX) this.#thin()
   }
 
-  // Return the points of the last seconds; 0: all.
-  since(seconds) {
-    if (!this.last || !seconds) return this.points
-    const from = this.last.time - seconds
+  // Return the points of the last seconds before a time, 0: all; without a time the newest ones.
+  since(seconds, now = this.last?.time ?? 0) {
+    const end = this.#indexAfter(now)
+    return this.points.slice(seconds ? this.#indexAfter(now - seconds, { before: true }) : 0, end)
+  }
+
+  // Return the index of the first point after a time; with `before`, of the first one that is not before it.
+  #indexAfter(time, { before = false } = {}) {
     let low = 0
     let high = this.points.length
     while (low < high) {
       const middle = (low + high) >> 1
-      if (this.points[middle].time < from) low = middle + 1
+      if (this.points[middle].time < time || (!before && this.points[middle].time === time)) low = middle + 1
       else high = middle
     }
-    return this.points.slice(low)
+    return low
   }
 
   // Of a long way the older half loses every other point: the newest ones stay exact.

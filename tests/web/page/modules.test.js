@@ -174,6 +174,8 @@ test("a trail is bounded, and keeps its newest points", () => {
   assert.ok(trail.points.length <= 40_001)
   assert.deepEqual(trail.last, { time: 999.99, x: 99_999, y: -99_999, heading: null })
   assert.equal(trail.since(1).length, 101)
+  assert.deepEqual(trail.since(0.02, 995).map(point => point.time), [994.98, 994.99, 995]) // of a recording
+  assert.equal(trail.since(0, -1).length, 0)
   assert.deepEqual(boundsOf([{ x: 1, y: 2 }, { x: -1, y: 5 }]), { left: -1, right: 1, bottom: 2, top: 5 })
   assert.equal(boundsOf([]), null)
 })
