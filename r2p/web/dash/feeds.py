@@ -7,6 +7,7 @@ watch it, ten times a second, and less often where that takes long.
 """
 
 import asyncio
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -50,8 +51,10 @@ class PlotStream(msgspec.Struct, eq=False):
 class TopicFeeds:
     """The topics that the pages of one process look at."""
 
-    def __init__(self, module: Module, types: TypeFinder) -> None:
+    def __init__(self, module: Module, types: TypeFinder, refused: Counter[str]) -> None:
+        """`refused` gets what can't be read."""
         self.types = types
+        self.refused = refused
         self.module = module
         self.node = Node("dash", module.space)
         self._feeds: dict[str, TopicFeed] = {}
@@ -175,6 +178,11 @@ class TopicFeed:
     def time(self) -> float:
         return self._loop.time()
 
+    def refuse(self, count: int) -> None:
+        """Count messages that can't be read, and look for their type."""
+        self._feeds.refused["messages of another type"] += count
+        self.learn_type()
+
     def learn_type(self) -> None:
         """Look up the type anew, as messages can't be read with the one that is known; at most once a second."""
         if self._learning is None:
@@ -236,14 +244,14 @@ class _Plots:
         if not samples:
             return
         if self._extractor is None:
-            self._feed.learn_type()
+            self._feed.refuse(len(samples))
             return
         before = self._extractor.undecodable
         times, columns = self._extractor.columns(
             [sample.stamp / SECOND for sample in samples], [sample.data for sample in samples]
         )
         if self._extractor.undecodable > before:
-            self._feed.learn_type()
+            self._feed.refuse(self._extractor.undecodable - before)
         if times:
             self._send(times, dict(zip(self._extractor.paths, columns, strict=True)))
 

@@ -54,7 +54,7 @@ class LiveSource(DashSource):
         self.types = types
         self.allow_publish = allow_publish
         self.allow_control = allow_control
-        self.feeds = TopicFeeds(module, types)
+        self.feeds = TopicFeeds(module, types, self.refused)
         self.log = LogFeed(lambda: LogFollower(module))
 
     async def __aenter__(self) -> Self:
