@@ -86,7 +86,7 @@ async def test_fields_are_found_by_words_and_a_paused_plot_rests(browser: Browse
         await tab.page.keyboard.type("odo pose.y")
         await tab.until("document.querySelectorAll('.choice').length === 1")
         await tab.page.keyboard.press("Enter")
-        await tab.page.keyboard.press("Escape")
+        await tab.page.click("text=Done")
         await tab.until("location.hash === '#/plots/odometry.pose.y' && r2p.stats.redraws > 0")
         await tab.page.keyboard.press("p")
         await tab.until(RESTS)
