@@ -49,7 +49,7 @@ async def test_filter_and_pause(browser: Browser, dash: Dash) -> None:
         await tab.until("r2p.store.topics.has('odometry')")
         await tab.page.keyboard.press("/")
         await tab.page.keyboard.type("odom")
-        await tab.until("document.querySelectorAll('#view tbody tr:not([hidden])').length === 1")
+        await tab.until("document.querySelector('#view table').querySelectorAll('tbody tr').length === 1")
         assert "odometry" in await tab.page.inner_text("#view tbody tr:not([hidden])")
         await tab.page.keyboard.press("Escape")
         await tab.page.focus("#view")
