@@ -18,6 +18,7 @@ from r2p.monitoring.buses import BusTables
 from r2p.monitoring.counters import ModuleCounters, clamp, network_name
 from r2p.monitoring.measuring import MeasuredTopic
 from r2p.monitoring.snapshot import (
+    CLASS_NAMES,
     Figures,
     LinkFigures,
     ModuleFigures,
@@ -28,16 +29,10 @@ from r2p.monitoring.snapshot import (
     TopicFigures,
 )
 from r2p.monitoring.topic_types import TypeFinder
-from r2p.runtime.sample import PublisherClass
 
 F = TypeVar("F", bound=Figures)
 
 _AGE_STEP = 10  # s
-_CLASS_NAMES = {
-    PublisherClass.PERIODIC: "periodic",
-    PublisherClass.SPORADIC: "sporadic",
-    PublisherClass.NON_REAL_TIME: "non real-time",
-}
 
 
 class FigureSources(msgspec.Struct, eq=False):
@@ -134,7 +129,7 @@ class TopicRows:
     def _publisher(self, topic: str, endpoint: Endpoint) -> PublisherFigures:
         klass = endpoint.publisher_class
         row = PublisherFigures(
-            endpoint.module, endpoint.node, endpoint.link, None if klass is None else _CLASS_NAMES[klass]
+            endpoint.module, endpoint.node, endpoint.link, None if klass is None else CLASS_NAMES[klass]
         )
         counters = self._sources.counters.get(endpoint.module)
         count = None if counters is None else counters.publisher(endpoint.module, endpoint.node, topic)

@@ -7,6 +7,15 @@ from collections.abc import Mapping
 
 import msgspec
 
+from r2p.runtime.sample import PublisherClass
+
+CLASS_NAMES = {
+    PublisherClass.PERIODIC: "periodic",
+    PublisherClass.SPORADIC: "sporadic",
+    PublisherClass.NON_REAL_TIME: "non real-time",
+}
+"""The classes of publishers in words."""
+
 
 class Figures(msgspec.Struct, omit_defaults=True):
     """The base of all figures: JSON leaves out what is not known."""

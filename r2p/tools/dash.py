@@ -85,9 +85,7 @@ async def live_source(
     session: Session, *, allow_publish: bool = False, allow_control: bool = False
 ) -> AsyncIterator[LiveSource]:
     """Watch the network of a command."""
-    types = Types(session.settings)
-    stated = {topic: types.stated(topic, None) for topic in session.settings.types}
-    finder = TypeFinder(session.module, {topic: cls for topic, cls in stated.items() if cls is not None})
+    finder = TypeFinder(session.module, Types(session.settings).stated_topics())
     async with (
         NetworkMonitor(session.module) as monitor,
         LiveSource(session.module, monitor, finder, allow_publish=allow_publish, allow_control=allow_control) as source,

@@ -14,8 +14,8 @@ from r2p.log_lines import printable
 from r2p.ros.clock import ros_time
 from r2p.ros.library import names_of_ros
 from r2p.tools.output import notify
-from r2p.tools.session import Run, Session, Settings, UsageError, joined, run_virtually
-from r2p.tools.types import Types, is_service, load_service
+from r2p.tools.session import Run, Session, UsageError, joined, run_virtually
+from r2p.tools.types import Types
 from r2p.web.foxglove.network import FoxgloveOptions
 from r2p.web.foxglove.server import ORIGINS, FoxgloveServer
 from r2p.web.server import LOOPBACK, WebFile, WebOptions, WebServer
@@ -28,8 +28,8 @@ _LOOK = 1.0  # seconds
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>r2p foxglove</title></head>
 <body><h1>r2p foxglove</h1>
-<p>This is no page to look at, but a server for Foxglove, Lichtblick and PlotJuggler:
-open a Foxglove WebSocket connection there, to the <code>ws:</code> address that <code>r2p foxglove</code> printed.</p>
+<p>This is a server for Foxglove, Lichtblick and PlotJuggler: open a Foxglove WebSocket connection there,
+to the <code>ws:</code> address that <code>r2p foxglove</code> printed.</p>
 <p>A page for browsers is served by <code>r2p dash</code>.</p></body></html>
 """
 
@@ -65,7 +65,7 @@ async def foxglove(
         name=f"r2p on {session.network_name}",
         allow_publish=allow_publish,
         allow_control=allow_control,
-        types=stated_types(session.settings),
+        types=Types(session.settings).stated_topics(),
     )
     origins = (*ORIGINS, *map(_checked_origin, origin or ()))
     options = WebOptions(host=host, port=port, origins=origins)
@@ -76,7 +76,7 @@ async def foxglove(
         FoxgloveServer(session.module, network) as server,
         WebServer(options, {"/": server.endpoint}, files) as web,
     ):
-        notify(f"connect Foxglove, Lichtblick or PlotJuggler to {socket_url(web)}; Ctrl-C ends")
+        notify(f"connect Foxglove, Lichtblick or PlotJuggler to {_socket_url(web)}; Ctrl-C ends")
         try:
             await _report_pages(web)
         finally:
@@ -88,7 +88,7 @@ command = joined(foxglove, endless=lambda _: True, loop=_loop)
 
 @contextlib.asynccontextmanager
 async def _following_clock(session: Session, *, sim_time: bool) -> AsyncIterator[None]:
-    """Follow /clock: a link to ROS does so itself, others don't."""
+    """Follow /clock over links that are not to ROS; those to ROS follow it themselves."""
     if sim_time:
         async with ros_time(session.module.space):
             yield
@@ -96,23 +96,10 @@ async def _following_clock(session: Session, *, sim_time: bool) -> AsyncIterator
         yield
 
 
-def socket_url(web: WebServer) -> str:
+def _socket_url(web: WebServer) -> str:
     """Return the address for clients, with the token if they need it."""
     address = urlsplit(web.url)
     return f"ws://{address.netloc}/" + (f"?token={quote(web.token, safe='')}" if web.token else "")
-
-
-def stated_types(settings: Settings) -> dict[str, type[r2p.Message]]:
-    """Return the types of topics that r2p.toml states; of services those of both topics. Raises UsageError."""
-    types = Types(settings)
-    stated: dict[str, type[r2p.Message]] = {}
-    for name, text in settings.types.items():
-        if is_service(text):
-            service = load_service(name, text)
-            stated |= {service.request_topic: service.requests.cls, service.response_topic: service.responses.cls}
-        elif (cls := types.stated(name, None)) is not None:
-            stated[name] = cls
-    return stated
 
 
 def _checked_origin(text: str) -> str:

@@ -216,6 +216,17 @@ class Types:
         found = self._load_named(topic) if topic in self._by_topic else []
         return found[0] if len(found) == 1 else None
 
+    def stated_topics(self) -> dict[str, type[r2p.Message]]:
+        """Return the types of topics that r2p.toml states, and of services those of both topics. Raises UsageError."""
+        found: dict[str, type[r2p.Message]] = {}
+        for name, text in self._by_topic.items():
+            if is_service(text):
+                service = load_service(name, text)
+                found |= {service.request_topic: service.requests.cls, service.response_topic: service.responses.cls}
+            else:
+                found[name], *_ = self._load_named(name)
+        return found
+
     def stated_service(self, name: str, given: str | None) -> Definition[Any, Any] | None:
         """Return the types of a service that the user states: `given` by --type, or in r2p.toml. Raises UsageError."""
         text = given or self._by_topic.get(name)

@@ -16,8 +16,9 @@ from websockets.typing import Origin, Subprotocol
 
 from r2p.errors import WebError
 from r2p.msg import Led
-from r2p.tools.foxglove import foxglove, stated_types
+from r2p.tools.foxglove import foxglove
 from r2p.tools.session import Settings, UsageError
+from r2p.tools.types import Types
 from tests.tools.rig import robot, tool
 
 if TYPE_CHECKING:
@@ -112,6 +113,6 @@ async def test_an_origin_that_is_none_is_a_usage_error(origin: str) -> None:
 
 async def test_types_are_those_of_the_settings() -> None:
     types = {"leds": "Led", "reset": "std_srvs/Trigger"}
-    found = stated_types(Settings(types=types))
+    found = Types(Settings(types=types)).stated_topics()
     assert found["leds"] is Led
     assert found.keys() == {"leds", "reset_q", "reset_r"}

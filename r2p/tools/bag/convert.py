@@ -16,7 +16,6 @@ from r2p.tools.session import UsageError, settings
 from r2p.tools.types import Types
 
 if TYPE_CHECKING:
-    import r2p
     from r2p.recording.convert.formats import ConversionResult
 
 
@@ -67,7 +66,7 @@ async def convert(
         start=first,
         end=last,
         types={topic: types.load(text) for topic, text in topic_pairs(type, "--type", "TOPIC=TYPE")},
-        known_types=_of_settings(types),
+        known_types=types.stated_topics(),
         ros=ros,
     )
     run = functools.partial(formats.convert, source, target, options, to=to, overwrite=overwrite)
@@ -76,12 +75,6 @@ async def convert(
     except OSError as error:
         raise UsageError(f"{error.filename or target}: {error.strerror}") from error
     await output.put(_record(source, target, result), _text(target, result, formats.lost_in_words(result.losses)))
-
-
-def _of_settings(types: Types) -> "dict[str, type[r2p.Message]]":
-    """Return the types of topics that r2p.toml states."""
-    found = {topic: types.stated(topic, None) for topic in settings().types}
-    return {topic: cls for topic, cls in found.items() if cls is not None}
 
 
 async def _in_thread(run: Any) -> "ConversionResult":

@@ -26,7 +26,7 @@ from r2p.tools.options import Format, byte_size, long_seconds, topic_pattern
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, Settings, UsageError, call_after, wait_until
 from r2p.tools.topic.watching import HINT_AFTER, is_published, suggest_topics
-from r2p.tools.types import Types, is_service, load_service
+from r2p.tools.types import Types
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
@@ -355,13 +355,7 @@ def _stated_types(
 ) -> dict[str, type[r2p.Message]]:
     """Return the types of topics that --type or r2p.toml state. Raises UsageError."""
     types = Types(settings)
-    stated: dict[str, type[r2p.Message]] = {}
-    for name, text in settings.types.items():
-        if is_service(text):
-            service = load_service(name, text)
-            stated |= {service.request_topic: service.requests.cls, service.response_topic: service.responses.cls}
-        elif (cls := types.stated(name, None)) is not None:
-            stated[name] = cls
+    stated = types.stated_topics()
     for text in given or ():
         topic, equals, name = text.partition("=")
         if not equals and topics is not None and len(topics) == 1:

@@ -61,7 +61,7 @@ class FoxgloveNetwork:
         self.channels = ChannelTable(module.space, node, types, changes.channel_added, changes.channel_removed)
         self.services = ServiceTable(node, types, changes.service_added, changes.service_removed)
         self.publications = ClientPublications(node, types)
-        self.parameters = NetworkParameters(module.network, changes.parameters_changed, changes.report_module)
+        self.parameters = NetworkParameters(module, changes.parameters_changed, changes.report_module)
 
     def review(self) -> None:
         """Look which topics and services there are now."""

@@ -15,14 +15,16 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 from r2p.errors import Error, ParameterError
-from r2p.modules.graph import ModuleView, NetworkView
+from r2p.modules.graph import ModuleView
+from r2p.modules.module import Module
+from r2p.monitoring.polling import PERIOD, QuestionPace
 from r2p.parameters.definition import ParameterInfo
+from r2p.units import SECOND
 from r2p.web.foxglove.protocol import FoxgloveParameter
 
 _TYPES = {"float": "float64", "floats": "float64_array"}
 _TEXTS = ("str", "enum")
 _AT_ONCE = 16  # modules that are asked
-_PERIOD = 1.0  # seconds between two questions for changes
 
 _Names = Collection[str]
 ParametersChanged = Callable[[list[ParameterInfo]], None]
@@ -56,8 +58,10 @@ def _number(info: ParameterInfo, value: Any) -> Any:
 class NetworkParameters:
     """Asks modules for their parameters, and follows them while a client wants that."""
 
-    def __init__(self, network: NetworkView, changed: ParametersChanged, report: Report) -> None:
-        self._network = network
+    def __init__(self, module: Module, changed: ParametersChanged, report: Report) -> None:
+        self._module = module
+        self._network = module.network
+        self._clock = module.space.clock
         self._changed = changed
         self._report = report
         self._following: dict[str, asyncio.Task[None]] = {}
@@ -135,8 +139,11 @@ class NetworkParameters:
 
     async def _follow(self, module: str) -> None:
         before: Mapping[tuple[str, str], ParameterInfo] = {}
+        pace = QuestionPace(self._module, module)
+        asked = self._clock.monotonic()
         with contextlib.suppress(Error, TimeoutError):  # `follow` begins again
-            async for known in self._network.follow_parameters(module, period=_PERIOD):
+            async for known in self._network.follow_parameters(module, period=PERIOD, pause=pace.pause):
+                pace.took = pace.took or (self._clock.monotonic() - asked) / SECOND
                 changed = [info for name, info in known.items() if before and _differ(before.get(name), info)]
                 before = known
                 if changed:

@@ -19,6 +19,7 @@ from r2p.errors import DecodeError
 from r2p.modules.statistics import ModuleStatistics, ServiceStatistics
 from r2p.monitoring.counters import ModuleCounters, clamp, network_name
 from r2p.monitoring.snapshot import (
+    CLASS_NAMES,
     BusFigures,
     BusTopicFigures,
     LinkFigures,
@@ -37,7 +38,6 @@ from r2p.recording.channels import BagChannel
 from r2p.recording.messages import BUS_LOADS, LOSSES, STATISTICS, RecorderLosses
 from r2p.recording.observations import NETWORK
 from r2p.ros.cdr import cdr
-from r2p.runtime.sample import PublisherClass
 from r2p.units import SECOND
 from r2p.web.dash.recorded.reader import ChunkTable, RecordingReader
 from r2p.web.dash.recorded.scan import RecordingScan
@@ -55,12 +55,6 @@ _STATISTICS_MAX = 1 << 20  # bytes of an answer of a module
 _NAME_MAX = 512  # characters; what has a longer name is not shown
 _TOPICS_MAX = 10_000
 _ATTACHMENT_MAX = 1 << 20  # bytes of the description of the network
-_CLASSES = {
-    PublisherClass.PERIODIC: "periodic",
-    PublisherClass.SPORADIC: "sporadic",
-    PublisherClass.NON_REAL_TIME: "non real-time",
-}
-_NUMBERED_CLASSES = {int(each): name for each, name in _CLASSES.items()}
 
 Node = tuple[str, str]
 """Module and node."""
@@ -156,7 +150,7 @@ class _Contents:
             info = each.info
             if info is not None and (info.module or info.node):
                 found[info.module, info.node] = PublisherFigures(
-                    info.module, info.node, info.link, _CLASSES[info.publisher_class]
+                    info.module, info.node, info.link, CLASS_NAMES[info.publisher_class]
                 )
         return found
 
