@@ -26,6 +26,7 @@ from r2p.runtime.sample import Sample
 from r2p.units import SECOND
 from r2p.web.client import WebClient
 from r2p.web.dash import protocol
+from r2p.web.dash.source import raw_fields
 
 BATCH = 0.04
 """Seconds for which points are collected."""
@@ -36,7 +37,6 @@ _BATCH_BYTES = 1 << 20  # of messages that wait; with more they are not collecte
 _MESSAGE_BYTES = 64  # of memory that a waiting message takes besides its data
 _WATCH_SHARE = 20  # the time that showing a message takes is at most one part of so many
 _TYPE_AGAIN = 1.0  # seconds after which the type of messages that can't be read is looked up again
-_HEX_MAX = 256  # bytes that are shown of a message of unknown type
 
 
 class PlotStream(msgspec.Struct, eq=False):
@@ -327,4 +327,4 @@ class _Watches:
             except DecodeError:
                 pass
         self._feed.learn_type()
-        return {"data": data[:_HEX_MAX].hex() + ("..." if len(data) > _HEX_MAX else "")}
+        return raw_fields(data)

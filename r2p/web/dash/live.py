@@ -22,14 +22,7 @@ from r2p.web.dash import orders, protocol
 from r2p.web.dash.feeds import PlotStream, TopicFeeds
 from r2p.web.dash.log_feed import LogFeed, PageLog
 from r2p.web.dash.publications import Publications, call_service, service_types
-from r2p.web.dash.source import DashSource, SourceSession
-
-STREAMS_MAX = 64
-"""Plots of one page."""
-COLUMNS_MAX = 64
-"""Fields of one plot."""
-WATCHES_MAX = 64
-"""Topics that one page watches."""
+from r2p.web.dash.source import DashSource, SourceSession, check_plot, check_watches
 
 _ZERO_MAX = 1 << 16  # bytes of a type whose zero message is given
 
@@ -153,12 +146,7 @@ class LiveSession(SourceSession):
     # Plots and watches
 
     async def _plot(self, request: protocol.Plot) -> None:
-        if not 0 <= request.stream <= protocol.STREAM_MAX:
-            raise WebError(f"the number of a stream is 0 to {protocol.STREAM_MAX}, not {request.stream}")
-        if not 1 <= len(request.fields) <= COLUMNS_MAX:
-            raise WebError(f"a plot has 1 to {COLUMNS_MAX} fields, not {len(request.fields)}")
-        if request.stream not in self._streams and len(self._streams) >= STREAMS_MAX:
-            raise WebError(f"a page has at most {STREAMS_MAX} plots: remove one")
+        check_plot(request, self._streams)
         topic, paths = _topic_and_paths(request.fields)
         self._remove_stream(request.stream)
         stream = PlotStream(self._client, request.stream, paths)
@@ -181,8 +169,7 @@ class LiveSession(SourceSession):
     async def _watch(self, request: protocol.Watch) -> None:
         if request.topic in self._watched:
             return
-        if len(self._watched) >= WATCHES_MAX:
-            raise WebError(f"a page watches at most {WATCHES_MAX} topics: close one")
+        check_watches(self._watched)
         self._source.feeds.watch(request.topic, self._client)
         self._watched.add(request.topic)
         with contextlib.suppress(InvalidName):  # of r2p's own topics there is nothing to measure

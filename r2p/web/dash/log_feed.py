@@ -6,17 +6,15 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from r2p.errors import WebError
 from r2p.monitoring.log import LogEntry, LogFollower
 from r2p.web.client import WebClient
 from r2p.web.dash import protocol
+from r2p.web.dash.source import log_level
 
 PERIOD = 0.1
 """Seconds for which records are collected."""
 WAITING_MAX = 1000
 """Records that wait for these; more of them are dropped, the oldest first."""
-
-LEVELS = {"DEBUG": 10, "INFO": 20, "WARNING": 30, "ERROR": 40, "FATAL": 50}
 
 
 class PageLog:
@@ -86,15 +84,14 @@ class LogFeed:
 
     async def add(self, page: PageLog, level: str) -> None:
         """Send a page the newest records that are known, and then each one. Raises WebError for an unknown level."""
-        if level not in LEVELS:
-            raise WebError(f"{level[:20]!r} is not a level of the log: write one of {', '.join(LEVELS)}")
+        least = log_level(level)
         if page not in self._pages:
             self._pages.append(page)
         if self._follower is None:
             self._follower = self._follow()
             self._follower.listeners.append(self._add_record)
             await self._follower.__aenter__()
-        page.begin(LEVELS[level], self._follower.records)
+        page.begin(least, self._follower.records)
 
     async def remove(self, page: PageLog) -> None:
         """Send a page no more records; without another page the subscription ends."""

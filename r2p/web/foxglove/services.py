@@ -126,7 +126,8 @@ class ServiceTable:
 def decode_as(cls: type[Message], encoding: str, data: bytes) -> Message:
     """Return the message that a client has sent in an encoding. Raises Error."""
     if encoding == CDR:
-        return cdr(cls).decode(data)  # type: ignore[no-any-return]
+        message: Message = cdr(cls).decode(data)
+        return message
     if encoding != JSON:
         raise Error(f"the encoding is {encoding[:40]!r}: send {CDR} or {JSON}")
     try:

@@ -16,8 +16,8 @@ from r2p.msg import Led
 from r2p.testing.network import Network
 from r2p.web.client import QUEUE_BYTES
 from r2p.web.dash import protocol
-from r2p.web.dash.live import STREAMS_MAX, WATCHES_MAX
 from r2p.web.dash.session import REQUEST_RATE, REQUESTS_MAX
+from r2p.web.dash.source import PLOTS_MAX, WATCHES_MAX
 from tests.transports.rtcan.networks import until
 from tests.web.rig import FakePage, live, open_page
 
@@ -84,9 +84,9 @@ async def test_thousands_of_plots_and_watches_are_refused_beyond_a_limit() -> No
             page.begin("plot", stream=stream, fields=["leds.led"])
             page.begin("watch", topic=f"nothing{stream}")
         await until(lambda: len([each for each in page.messages if "id" in each]) == 400)
-        assert len([each for each in page.messages if "result" in each]) == STREAMS_MAX
+        assert len([each for each in page.messages if "result" in each]) == PLOTS_MAX
         assert list(source.feeds._feeds) == ["leds"]
-        assert STREAMS_MAX == WATCHES_MAX == 64
+        assert PLOTS_MAX == WATCHES_MAX == 64
         assert leds.subscribers == 1
 
 

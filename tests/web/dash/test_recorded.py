@@ -142,7 +142,7 @@ async def test_a_plot_of_a_part_has_all_its_messages(recording: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "why"),
     [
-        ([], "1 to 100 fields"),
+        ([], "1 to 64 fields"),
         (["wheels.middle"], "has no number 'middle'; it has left, right, names[]"),
         (["odometry.x"], "no topic 'odometry'"),
         (["wheels.left", "odometry.x"], "of one topic"),

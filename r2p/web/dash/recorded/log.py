@@ -4,11 +4,10 @@ A recorder's own log has the records of all modules. Where there is none, it is 
 """
 
 import itertools
-import logging
 from functools import partial
 from typing import Any, Final
 
-from r2p.errors import DecodeError, WebError
+from r2p.errors import DecodeError
 from r2p.names import LOG
 from r2p.recording.bag import Bag
 from r2p.recording.channels import BagChannel
@@ -21,8 +20,6 @@ from r2p.web.dash.recorded.reader import ChunkTable, RecordingReader
 RECORDS_MAX: Final = 1000
 """Records that a page is sent at once."""
 
-LEVELS: Final = {name: getattr(logging, name) for name in ("DEBUG", "INFO", "WARNING", "ERROR", "FATAL")}
-
 _CHUNKS_MAX = 4000  # that are looked into for one answer: enough for half an hour without a record
 
 
@@ -33,10 +30,8 @@ class RecordedLog:
         self._reader = reader
         self._table: ChunkTable | None = None
 
-    async def before(self, time: int, level: str, after: int = -1) -> list[dict[str, Any]]:
-        """Return the newest records up to `time` (ns) and after `after`, oldest first. Raises WebError for a level."""
-        if level not in LEVELS:
-            raise WebError(f"{level[:20]!r} is not a level: these are {', '.join(LEVELS)}")
+    async def before(self, time: int, level: int, after: int = -1) -> list[dict[str, Any]]:
+        """Return the newest records up to `time` (ns) and after `after`, oldest first."""
         bag = await self._reader.bag()
         if self._table is None:
             is_log = _is_own if any(each.name == LOGS for each in bag.channels) else _is_other
@@ -46,7 +41,7 @@ class RecordedLog:
             wanted = self._table.ids[number]
             records = await self._reader.run(partial(self._reader.records, bag, number, chunk, wanted))
             span = [each for each in records if after < each[0] <= time]
-            found += await self._reader.run(partial(_shown, bag, number, span, LEVELS[level]))
+            found += await self._reader.run(partial(_shown, bag, number, span, level))
             if len(found) >= RECORDS_MAX:
                 break
         found.sort(key=lambda each: int(each["time"]))

@@ -12,9 +12,9 @@ from r2p.recording.format import CDR
 from r2p.recording.mcap_reader import MessageRecord
 from r2p.web.dash.recorded.plots import wanted_channels
 from r2p.web.dash.recorded.reader import ChunkTable, RecordingReader
+from r2p.web.dash.source import raw_fields
 
 _CHUNKS_MAX: Final = 4000  # that are looked into for one message; most files say which ones have the topic
-_HEX_MAX: Final = 256  # bytes that are shown of a message of unknown type
 
 
 def message_of(channel: BagChannel, data: bytes) -> Message:
@@ -93,4 +93,4 @@ def _fields(channel: BagChannel, data: bytes) -> dict[str, Any]:
     try:
         return to_plain(message_of(channel, data), "short")
     except DecodeError:
-        return {"data": data[:_HEX_MAX].hex() + ("..." if len(data) > _HEX_MAX else "")}
+        return raw_fields(data)

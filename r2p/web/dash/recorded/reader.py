@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from r2p.errors import BagError
 from r2p.recording.bag import Bag
@@ -115,14 +115,15 @@ class ChunkCache:
     def __init__(self, limit: int = _KEPT_BYTES) -> None:
         self._limit = limit
         self._bytes = 0
-        self._kept: OrderedDict[object, tuple[object, int]] = OrderedDict()
+        self._kept: OrderedDict[object, tuple[Any, int]] = OrderedDict()
 
     def get(self, key: object, read: Callable[[], tuple[T, int]]) -> T:
         """Return what is kept under a key, or read it, which returns it with its bytes."""
         known = self._kept.get(key)
         if known is not None:
             self._kept.move_to_end(key)
-            return known[0]  # type: ignore[return-value]
+            kept: T = known[0]
+            return kept
         found, size = read()
         size += _OF_RECORD
         if size > self._limit // 2:

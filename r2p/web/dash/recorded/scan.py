@@ -78,7 +78,7 @@ _GAP_PAUSES = 3  # ... and of its longest pause so far: messages may come in bur
 _STEADY = 10  # messages from which the rate of a topic is known
 _BATCH_BYTES = 1 << 20  # of chunks that are read in one step
 _OVERHEAD = 200  # bytes of a change, besides
-_TOLD_EVERY = 0.25  # s between two looks of those that follow the scan
+_NEWS_EVERY = 0.25  # s between two looks of those that follow the scan
 
 
 class History(Generic[K, V]):
@@ -169,7 +169,7 @@ class RecordingScan:
     async def changed(self) -> None:
         """Wait until more is known; at most four times a second."""
         changed = self._changed
-        await asyncio.sleep(_TOLD_EVERY)
+        await asyncio.sleep(_NEWS_EVERY)
         await changed.wait()
 
     def _notify(self) -> None:
@@ -320,19 +320,19 @@ class _Observed:
         self._waiting -= len(waiting)
         found += [each for each in waiting if time - each.time > ANSWER_WITHIN]
 
-    def _event(self, time: int, event: RecordedEvent, size: int) -> list[TimelineEvent]:
+    def event(self, time: int, event: RecordedEvent, size: int) -> list[TimelineEvent]:
         if event.kind.startswith("module ") and event.module:
             self._scan.module_events.add(event.module, time, event, size)
         elif event.kind in {"master", "no master"}:
             self._scan.masters.add(event.link, time, event.module if event.kind == "master" else "", size)
         return [event_of(time, event)]
 
-    def _signal(self, time: int, signal: RecordedSignal, _size: int) -> list[TimelineEvent]:
+    def signal(self, time: int, signal: RecordedSignal, _size: int) -> list[TimelineEvent]:
         if signal.source == "publisher":
             self._signalled.add(signal.module)
         return [signal_event(time, signal, self._reasons)]
 
-    def _log(self, time: int, record: LogRecord, _size: int) -> list[TimelineEvent]:
+    def log(self, time: int, record: LogRecord, _size: int) -> list[TimelineEvent]:
         event = log_event(time, record)
         if event is None:
             return []
@@ -347,24 +347,24 @@ class _Observed:
         self._uncounted.setdefault(module, []).append(miss)
         return []
 
-    def _slot_table(self, time: int, table: SlotTable, size: int) -> list[TimelineEvent]:
+    def slot_table(self, time: int, table: SlotTable, size: int) -> list[TimelineEvent]:
         is_kept = self._scan.slots.add(table.bus, time, table, size)
         return slot_changes(self._slots, time, table) if is_kept else []
 
-    def _parameter(self, time: int, value: ParameterValue, size: int) -> list[TimelineEvent]:
+    def parameter(self, time: int, value: ParameterValue, size: int) -> list[TimelineEvent]:
         is_kept = self._scan.parameters.add((value.module, value.node, value.name), time, value, size)
         change = parameter_change(self._parameters, time, value) if is_kept else None
         return [] if change is None else [change]
 
-    def _recorder(self, time: int, losses: RecorderLosses, _size: int) -> list[TimelineEvent]:
+    def recorder(self, time: int, losses: RecorderLosses, _size: int) -> list[TimelineEvent]:
         return recorder_losses(self._losses, time, losses)
 
 
 _READERS: dict[str, tuple[type[Message], Callable[[_Observed, int, Any, int], list[TimelineEvent]]]] = {
-    EVENTS: (RecordedEvent, _Observed._event),  # noqa: SLF001
-    SIGNALS: (RecordedSignal, _Observed._signal),  # noqa: SLF001
-    LOGS: (LogRecord, _Observed._log),  # noqa: SLF001
-    SLOTS: (SlotTable, _Observed._slot_table),  # noqa: SLF001
-    PARAMETERS: (ParameterValue, _Observed._parameter),  # noqa: SLF001
-    LOSSES: (RecorderLosses, _Observed._recorder),  # noqa: SLF001
+    EVENTS: (RecordedEvent, _Observed.event),
+    SIGNALS: (RecordedSignal, _Observed.signal),
+    LOGS: (LogRecord, _Observed.log),
+    SLOTS: (SlotTable, _Observed.slot_table),
+    PARAMETERS: (ParameterValue, _Observed.parameter),
+    LOSSES: (RecorderLosses, _Observed.recorder),
 }

@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
-from r2p.errors import BagError, Error, WebError
+from r2p.errors import BagError, Error
 from r2p.log_lines import get_logger
 from r2p.monitoring.snapshot import NetworkSnapshot
 from r2p.recording.mcap_reader import TIME_MAX
@@ -14,21 +14,14 @@ from r2p.web.client import WebClient
 from r2p.web.dash import protocol
 from r2p.web.dash.live import describe
 from r2p.web.dash.recorded.cursor import Cursor
-from r2p.web.dash.recorded.log import LEVELS, RECORDS_MAX
+from r2p.web.dash.recorded.log import RECORDS_MAX
 from r2p.web.dash.recorded.messages import WatchedTopic
 from r2p.web.dash.recorded.plots import Columns, PlotProgress, RecordedPlot, topic_of, wanted_channels
 from r2p.web.dash.recorded.scan import STEPS
-from r2p.web.dash.source import SourceSession
+from r2p.web.dash.source import SourceSession, check_plot, check_watches, log_level
 
 if TYPE_CHECKING:
     from r2p.web.dash.recorded.source import RecordedSource
-
-PLOTS_MAX = 64
-"""Streams of one page."""
-FIELDS_MAX = 100
-"""Fields of one stream."""
-WATCHES_MAX = 64
-"""Topics that one page watches."""
 
 _TICK = 0.1  # s between two news of a recording that plays
 _STATES = 5  # ticks between two states of it
@@ -56,7 +49,8 @@ class RecordedSession(SourceSession):
         self._plots: dict[int, asyncio.Task[None] | None] = {}
         """The plots by stream; None while it is being looked up."""
         self._watched: dict[str, WatchedTopic] = {}
-        self._level = ""
+        self._level: int | None = None
+        """The level from which on the page follows the log; None: it does not."""
         self._logged: int | None = None
         """The instant up to which the page has the log; None: it has to be sent anew."""
         self._has_timeline = False
@@ -213,12 +207,7 @@ class RecordedSession(SourceSession):
 
     async def _plot(self, request: protocol.Plot) -> None:
         bag = await self._source.opened()
-        if not 0 <= request.stream <= protocol.STREAM_MAX:
-            raise WebError(f"the number of a stream is 0 to {protocol.STREAM_MAX}, not {request.stream}")
-        if not 1 <= len(request.fields) <= FIELDS_MAX:
-            raise WebError(f"a plot has 1 to {FIELDS_MAX} fields, not {len(request.fields)}")
-        if request.stream not in self._plots and len(self._plots) >= PLOTS_MAX:
-            raise WebError(f"a page has at most {PLOTS_MAX} plots: remove one")
+        check_plot(request, self._plots)
         topic, paths = topic_of(request.fields, bag.topics)
         plot = RecordedPlot(self._source.reader, topic, paths, (_ns(request.start), _ns(request.end)), request.points)
         await self._stop_plot(request)
@@ -255,8 +244,7 @@ class RecordedSession(SourceSession):
     async def _watch(self, request: protocol.Watch) -> None:
         if request.topic in self._watched:
             return
-        if len(self._watched) >= WATCHES_MAX:
-            raise WebError(f"a page watches at most {WATCHES_MAX} topics: close one")
+        check_watches(self._watched)
         watched = WatchedTopic(self._source.reader, request.topic)
         await watched.open()
         self._watched[request.topic] = watched
@@ -266,9 +254,7 @@ class RecordedSession(SourceSession):
         self._watched.pop(request.topic, None)
 
     async def _follow_log(self, request: protocol.FollowLog) -> None:
-        if request.level not in LEVELS:
-            raise WebError(f"{request.level[:20]!r} is not a level of the log: write one of {', '.join(LEVELS)}")
-        self._level, self._logged = request.level, None
+        self._level, self._logged = log_level(request.level), None
         self._moved.set()
 
     async def _send_log(self, time: int) -> None:
