@@ -1,10 +1,11 @@
 """One client of a WebSocket: what waits for it is bounded, and it never keeps others waiting."""
 
 import asyncio
+import sys
 from collections import Counter, deque
 from collections.abc import AsyncIterator
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
@@ -18,6 +19,16 @@ _ROOM = 1 << 16  # bytes that wait for a client beyond which it has no room for 
 _MESSAGE_BYTES = 128  # of memory that a waiting message takes besides its data
 
 
+class _WaitingMessage(NamedTuple):
+    """A message in a queue. `number` is its place among all messages, `size` the memory that it takes (bytes)."""
+
+    number: int
+    message: str | bytes
+    stream: str | None
+    amount: int
+    size: int
+
+
 class WebClient:
     """A connected client. `send` never waits; iterating yields its messages until it leaves."""
 
@@ -26,7 +37,11 @@ class WebClient:
         """What this client was too slow for, by stream."""
         self.subprotocol = connection.subprotocol
         self._connection = connection
-        self._queue: deque[tuple[str | bytes, str | None, int]] = deque()
+        self._queue: deque[_WaitingMessage] = deque()
+        """Messages without a stream."""
+        self._streams: deque[_WaitingMessage] = deque()
+        """Those of streams, in a queue of their own: dropping the oldest one must not take longer behind answers."""
+        self._count = 0
         self._bytes = 0  # of streams
         self._answers = 0  # bytes of messages without a stream
         self._waiting: Counter[str] = Counter()
@@ -61,16 +76,19 @@ class WebClient:
         """
         if self._closing is not None:
             return False
-        size = len(message) + _MESSAGE_BYTES
-        self._queue.append((message, stream, amount))
+        size = sys.getsizeof(message) + _MESSAGE_BYTES  # a text with one emoji has four bytes for each character
+        self._count += 1
+        waiting = _WaitingMessage(self._count, message, stream, amount, size)
         self._wake.set()
         if self._bytes + self._answers + size > _ROOM:
             self._has_room.clear()
         if stream is None:
+            self._queue.append(waiting)
             self._answers += size
             if self._answers > ANSWERS_BYTES:
                 self._give_up()
             return True
+        self._streams.append(waiting)
         self._bytes += size
         self._waiting[stream] += 1
         if self._bytes <= QUEUE_BYTES:
@@ -96,42 +114,42 @@ class WebClient:
 
     def _give_up(self) -> None:
         self._queue.clear()
+        self._streams.clear()
         self._waiting.clear()
         self._bytes = self._answers = 0
         self.close(1008, "too slow: what it asked for does not fit the queue")
 
     def _drop(self) -> None:
         """Drop the oldest messages of streams, until the rest fits."""
-        kept: deque[tuple[str | bytes, str | None, int]] = deque()
-        while self._queue and self._bytes > QUEUE_BYTES:
-            entry = self._queue.popleft()
-            message, stream, amount = entry
-            if stream is None:
-                kept.append(entry)
-            else:
-                self._forget(message, stream)
-                self.dropped[stream] += amount
-        self._queue.extendleft(reversed(kept))
+        while self._streams and self._bytes > QUEUE_BYTES:
+            oldest = self._streams.popleft()
+            self._forget(oldest)
+            if oldest.stream is not None:
+                self.dropped[oldest.stream] += oldest.amount
 
-    def _forget(self, message: str | bytes, stream: str | None) -> None:
+    def _next(self) -> _WaitingMessage | None:
+        """Take the message that has waited longest."""
+        if self._streams and not (self._queue and self._queue[0].number < self._streams[0].number):
+            return self._streams.popleft()
+        return self._queue.popleft() if self._queue else None
+
+    def _forget(self, entry: _WaitingMessage) -> None:
         """Count a message no longer as waiting."""
-        size = len(message) + _MESSAGE_BYTES
-        if stream is None:
-            self._answers -= size
+        if entry.stream is None:
+            self._answers -= entry.size
             return
-        self._bytes -= size
-        self._waiting[stream] -= 1
-        if not self._waiting[stream]:
-            del self._waiting[stream]
+        self._bytes -= entry.size
+        self._waiting[entry.stream] -= 1
+        if not self._waiting[entry.stream]:
+            del self._waiting[entry.stream]
 
     async def _write(self) -> None:
         try:
             while True:
                 self._wake.clear()
-                while self._queue:
-                    message, stream, _ = self._queue.popleft()
-                    self._forget(message, stream)
-                    await self._connection.send(message)
+                while (entry := self._next()) is not None:
+                    self._forget(entry)
+                    await self._connection.send(entry.message)
                     if self._bytes + self._answers <= _ROOM:
                         self._has_room.set()
                 await self._wake.wait()

@@ -54,6 +54,7 @@ _REQUEST_TIME = 10.0  # seconds for a request and its answer
 _ORIGINS_MAX = 16  # refused pages whose names are kept
 _BACKLOG = 16  # connections that are accepted in one turn of the event loop
 _WRITE_BUFFER = 1 << 18  # bytes of a connection beyond which its client's own queue fills
+_PONGS_MAX = 1 << 16  # bytes of answers to pings beyond that, which would pass by the client's queue
 _PORT_ERRORS = (errno.EADDRINUSE, errno.EACCES)
 _CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -87,8 +88,8 @@ class WebEndpoint(msgspec.Struct, frozen=True):
 class WebOptions(msgspec.Struct, frozen=True, kw_only=True):
     """Where a server listens, and who may connect. `port` 0 takes a free one.
 
-    `token`: what clients must name; None: a random one where the address is not loopback. `origins`: pages of other
-    servers that may connect, as `https://app.foxglove.dev`.
+    `token`: what clients must name; None or empty: a random one where the address is not loopback. `origins`: pages of
+    other servers that may connect, as `https://app.foxglove.dev`.
     """
 
     host: str = LOOPBACK
@@ -102,8 +103,10 @@ class _WebConnection(ServerConnection):
 
     def __init__(self, listener: "WebServer", *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        self.lost = False
         self._listener = listener
         self._received = 0
+        self._pongs = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -111,6 +114,7 @@ class _WebConnection(ServerConnection):
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
+        self.lost = True
         self._listener.forget(self)
 
     def data_received(self, data: bytes) -> None:
@@ -120,7 +124,19 @@ class _WebConnection(ServerConnection):
                 self._listener.refused["request too long"] += 1
                 self.transport.abort()
                 return
+        waiting = self.transport.get_write_buffer_size()
         super().data_received(data)
+        if waiting > _WRITE_BUFFER:
+            self._limit_pongs(self.transport.get_write_buffer_size() - waiting)
+        else:
+            self._pongs = 0
+
+    def _limit_pongs(self, size: int) -> None:
+        """End the connection of a client that sends pings and does not read: their answers have no other limit."""
+        self._pongs += max(0, size)
+        if self._pongs > _PONGS_MAX:
+            self._listener.refused["pings of a client that does not read"] += 1
+            self.transport.abort()
 
 
 class WebServer:
@@ -139,8 +155,8 @@ class WebServer:
         self._options = options
         self._endpoints = endpoints
         self._files = files or {}
-        token = options.token
-        self.token = secrets.token_urlsafe(16) if token is None and not is_loopback(options.host) else token
+        random = None if is_loopback(options.host) else secrets.token_urlsafe(16)
+        self.token = options.token or random
         """What each WebSocket has to name as `?token=`; None: nothing."""
 
     @property
@@ -296,9 +312,10 @@ class WebServer:
         if endpoint.subprotocols and connection.subprotocol is None:
             await connection.close(1002, f"offer a subprotocol: {' or '.join(endpoint.subprotocols)}")
             return
+        own = cast("_WebConnection", connection)
         async with WebClient(connection) as client:
             self.clients.append(client)
-            self._others.pop(cast("_WebConnection", connection), None)
+            self._others.pop(own, None)
             try:
                 await endpoint.handle(client)
             except Exception:
@@ -306,6 +323,8 @@ class WebServer:
                 await connection.close(1011, "internal error: see the log")
             finally:
                 self.clients.remove(client)
+                if not own.lost:  # until it is closed, it counts as a connection
+                    self._others[own] = None
 
 
 def is_loopback(host: str) -> bool:

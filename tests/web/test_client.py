@@ -45,6 +45,21 @@ async def test_the_oldest_messages_of_streams_are_dropped_and_counted() -> None:
         assert client.dropped == {"plot 1": 10 * (2000 - len(numbers))}
 
 
+async def test_answers_and_streams_keep_their_order() -> None:
+    async with client_that_reads_nothing() as (client, connection):
+        for number in range(8):
+            client.send(f"{number}", "plot 1" if number % 3 else None)
+        connection.reads.set()
+        await asyncio.sleep(1)
+        assert connection.sent == [f"{number}" for number in range(8)]
+
+
+async def test_a_text_counts_with_the_memory_that_it_takes() -> None:
+    async with client_that_reads_nothing() as (client, _):
+        client.send("\N{ROBOT FACE}" * 1000, "log")
+        assert client._bytes >= 4000
+
+
 async def test_a_client_that_does_not_read_its_answers_is_disconnected() -> None:
     async with client_that_reads_nothing() as (client, connection):
         for _ in range(ANSWERS_BYTES // len(_LARGE) + 1):

@@ -166,6 +166,32 @@ async def test_a_message_that_is_too_long_ends_its_client_alone() -> None:
         assert await other.recv() == "hello"
 
 
+async def test_pings_of_a_client_that_does_not_read_end_it_alone() -> None:
+    async with serving() as server:
+        reader, writer = await asyncio.open_connection(*server.address)
+        key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13"
+        head = f"GET /echo HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{key}\r\n\r\n"
+        writer.write(head.encode())
+        await reader.readuntil(b"\r\n\r\n")
+        ping = b"\x89\xfd" + bytes(4 + 125)
+        with contextlib.suppress(ConnectionError):
+            while not server.refused:
+                writer.write(1000 * ping)
+                await writer.drain()
+        assert server.refused == {"pings of a client that does not read": 1}
+        writer.close()
+        assert await says_hello(server)
+
+
+async def test_a_client_counts_until_its_connection_is_closed() -> None:
+    async with serving() as server:
+        async with connect(websocket_url(server), proxy=None):
+            await until(lambda: server.clients)
+            assert not server._others
+        await until(lambda: not server.clients)
+        await until(lambda: not server._others)
+
+
 async def test_an_error_of_ours_is_in_the_log_and_ends_its_client_alone(caplog: pytest.LogCaptureFixture) -> None:
     async def fail(_client: WebClient) -> None:
         raise ZeroDivisionError
@@ -208,6 +234,11 @@ async def test_the_link_of_a_server_on_all_addresses_has_one_that_others_can_ope
     async with WebServer(WebOptions(host="0.0.0.0"), {}) as server:
         assert "//0.0.0.0" not in server.url
         assert f"#token={server.token}" in server.url
+
+
+def test_an_empty_token_is_none() -> None:
+    assert WebServer(WebOptions(token=""), {}).token is None
+    assert WebServer(WebOptions(token="", host="0.0.0.0"), {}).token
 
 
 async def test_only_loopback_goes_without_a_token() -> None:

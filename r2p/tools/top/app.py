@@ -266,7 +266,7 @@ class TablesScreen(Screen[None]):
     def action_filter(self) -> None:
         """Ask for a text that rows must have."""
         entry = self.query_one(Input)
-        entry.value = self.wanted
+        entry.value = printable(self.wanted)
         entry.add_class("shown")
         self.query_one(KeyLine).display = False
         entry.focus()
@@ -338,7 +338,7 @@ class TablesScreen(Screen[None]):
             await self.app.push_screen(NodeScreen(self._details, row.module.name, row.node.name))
         elif self.view.name == "modules":
             self.action_view("nodes")
-            self.wanted = f"{row.name}/"
+            self.wanted = printable(f"{row.name}/")
             self._draw()
         elif isinstance(row, ServiceFigures) and row.servers:
             module, _, node = row.servers[0].rpartition("/")

@@ -111,8 +111,9 @@ class NodeScreen(Screen[None]):
         else:
             self._setting = info
             entry = self.query_one(Input)
-            entry.value = shown(info, info.value)
-            entry.placeholder = f"{info.name}: {range_text(info) or info.kind} {info.unit}".strip()
+            value = shown(info, info.value)
+            entry.value = value if value.isprintable() else ""  # an entry is drawn as it is
+            entry.placeholder = printable(f"{info.name}: {range_text(info) or info.kind} {info.unit}".strip())
             self._show_entry(visible=True)
 
     def _show_entry(self, *, visible: bool) -> None:

@@ -109,7 +109,9 @@ def matching(view: View, rows: list[Any], wanted: str) -> list[Any]:
     """Return the rows with this text in their name, or in another text; without regard to case."""
     lower = wanted.lower()
     texts = [each for each in view.columns if each.is_text]
-    return [row for row in rows if any(lower in (each.value(row) or "").lower() for each in texts)] if lower else rows
+    if not lower:
+        return rows
+    return [row for row in rows if any(lower in printable(each.value(row) or "").lower() for each in texts)]
 
 
 def is_of_tool(module: str) -> bool:

@@ -58,7 +58,7 @@ class KeyLine(TextLines):
 
     def say(self, message: str) -> None:
         """Show a message."""
-        self.show(Text(message, style="bold yellow"))
+        self.show(Text(printable(message), style="bold yellow"))
 
     def show_keys(self) -> None:
         """Show the keys again."""

@@ -214,7 +214,10 @@ encode = msgspec.json.Encoder().encode
 
 def decode(data: str | bytes) -> DashRequest:
     """Decode a request. Raises msgspec.ValidationError or msgspec.DecodeError, in words for the author of a page."""
-    request: DashRequest = _decoder.decode(data)
+    try:
+        request: DashRequest = _decoder.decode(data)
+    except RecursionError as error:
+        raise msgspec.DecodeError(str(error)) from None
     return request
 
 

@@ -13,6 +13,7 @@ from r2p.msg import Odometry, Pose3
 from r2p.tools.output import notify
 from r2p.tools.top.app import TopApp
 from r2p.tools.top.figures_table import FiguresTable
+from r2p.tools.top.text_lines import KeyLine
 from r2p.tools.top.topic_screen import TopicScreen
 from tests.tools.rig import robot, tool
 from tests.tools.top.network import line_of, network, screen_lines, screen_text, topic
@@ -208,6 +209,17 @@ async def test_notices_and_log_records_take_the_line_of_keys_until_the_next_key(
         assert screen_lines(app)[-1] == r"r2p: link tcp:1.2.3.4:5 is up\x1b[2J"
         await pilot.press("down")
         assert screen_lines(app)[-1].startswith("q quit")
+
+
+async def test_what_other_modules_write_is_shown_as_text() -> None:
+    async with shown() as (app, pilot):
+        app.tables.query_one(KeyLine).say("limit of \x1b]0;title\x07 [bold]is[/bold] 3")
+        await pilot.pause()
+        assert screen_lines(app)[-1] == r"limit of \x1b]0;title\x07 [bold]is[/bold] 3"
+        app.tables.wanted = "\x1b[2J[/]"
+        await pilot.press("slash")
+        await pilot.pause()
+        assert r"\x1b[2J[/]" in screen_text(app)
 
 
 async def test_q_quits() -> None:

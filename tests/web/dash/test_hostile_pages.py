@@ -55,6 +55,7 @@ def test_no_bytes_are_a_request_by_chance(data: str | bytes) -> None:
         "",
         "nonsense",
         "[" * 100_000,
+        '{"op": "publish", "id": 1, "topic": "leds", "value": {"led": ' + "[" * 100_000,
         b"\xff\xfe",
         '{"op": "unheard-of", "id": 1}',
         '{"op": "plot", "id": 1}',
