@@ -1,7 +1,8 @@
 """Serves one client of the protocol: what it subscribes to, publishes, calls, reads and sets.
 
 Nothing that a client sends ends its session: what is wrong is answered by a `status`, and counted in the server's
-`refused`. What takes time runs in tasks, REQUESTS_MAX at once, so that messages are not kept waiting.
+`refused`. What takes time runs in tasks, REQUESTS_MAX at once, so that messages are not kept waiting. A client that
+sends much at once is served for 5 ms in one turn of the event loop, so that others are not kept waiting.
 """
 
 import asyncio
@@ -26,6 +27,10 @@ CHANNELS_MAX = 256
 """Channels that one client publishes."""
 NAMES_MAX = 4096
 """Names of parameters that one client follows."""
+MISTAKES_MAX = 100
+"""Mistakes of one client per second that are answered; more are only counted."""
+
+_TURN = 0.005  # seconds
 
 _NO_PUBLISHING = "r2p foxglove lets no client publish or call services: start it with --allow-publish"
 _NO_CONTROL = "r2p foxglove lets no client set parameters: start it with --allow-control"
@@ -41,12 +46,16 @@ class FoxgloveSession:
         self._tasks: set[asyncio.Task[None]] = set()
         self._subscriptions: dict[int, int] = {}
         """Channels by the client's numbers of its subscriptions."""
+        self._subscribed: set[int] = set()
+        """These channels."""
         self._publications: dict[int, ClientPublication] = {}
         self._followed: set[str] | None = set()
         """The parameters whose changes are sent; None: all."""
         self._graph: ConnectionGraph | None = None
         self._lost: dict[str, int] = {}
         """Lost messages by channel, as far as the client knows."""
+        self._mistakes = 0  # since ...
+        self._mistakes_since = 0.0  # s
         self._handlers: dict[type, Callable[[Any], object]] = {
             protocol.SubscribeChannels: self._subscribe,
             protocol.UnsubscribeChannels: self._unsubscribe,
@@ -65,16 +74,26 @@ class FoxgloveSession:
 
     async def run(self) -> None:
         """Serve the client until it leaves."""
+        loop = asyncio.get_running_loop()
+        busy = 0.0
         try:
             async for data in self.client:
-                try:
-                    message = protocol.decode(data)
-                except DecodeError as error:
-                    self._refuse("malformed message", str(error))
-                    continue
-                await self._handle(message)
+                begin = loop.time()
+                await self._receive(data)
+                busy += loop.time() - begin
+                if busy > _TURN:
+                    busy = 0.0
+                    await asyncio.sleep(0)
         finally:
             self._close()
+
+    async def _receive(self, data: str | bytes) -> None:
+        try:
+            message = protocol.decode(data)
+        except DecodeError as error:
+            self._refuse("malformed message", str(error))
+        else:
+            await self._handle(message)
 
     async def _handle(self, message: ClientMessage) -> None:
         found = self._handlers[type(message)](message)
@@ -98,7 +117,16 @@ class FoxgloveSession:
     def _refuse(self, reason: str, text: str) -> None:
         """Count what can't be done, and say why."""
         self._network.refused[reason] += 1
-        self.status(StatusLevel.ERROR, text)
+        self._complain(StatusLevel.ERROR, text)
+
+    def _complain(self, level: StatusLevel, text: str) -> None:
+        """Say what is wrong, unless much was wrong within this second."""
+        now = asyncio.get_running_loop().time()
+        if now - self._mistakes_since >= 1.0:
+            self._mistakes, self._mistakes_since = 0, now
+        self._mistakes += 1
+        if self._mistakes <= MISTAKES_MAX:
+            self.status(level, text)
 
     def report_losses(self) -> None:
         """Send how many messages this client was too slow for, where there are more than at the last report."""
@@ -110,7 +138,9 @@ class FoxgloveSession:
 
     def channel_removed(self, number: int) -> None:
         """Forget the subscriptions of a channel that is gone."""
-        self._subscriptions = {mine: channel for mine, channel in self._subscriptions.items() if channel != number}
+        if number in self._subscribed:
+            self._subscribed.remove(number)
+            self._subscriptions = {mine: channel for mine, channel in self._subscriptions.items() if channel != number}
 
     # Channels
 
@@ -119,17 +149,19 @@ class FoxgloveSession:
             channel = self._network.channels.by_number.get(each.channel_id)
             if channel is None:
                 self._refuse("unknown channel", f"there is no channel {each.channel_id}")
-            elif each.id in self._subscriptions or each.channel_id in self._subscriptions.values():
+            elif each.id in self._subscriptions or each.channel_id in self._subscribed:
                 text = f"{channel.info.topic} is subscribed already, or the subscription {each.id} is in use"
-                self.status(StatusLevel.WARNING, f"{text}: ignored")
+                self._complain(StatusLevel.WARNING, f"{text}: ignored")
             else:
                 self._subscriptions[each.id] = each.channel_id
+                self._subscribed.add(each.channel_id)
                 channel.subscribe(self.client, each.id)
 
     def _unsubscribe(self, message: protocol.UnsubscribeChannels) -> None:
         for number in message.subscription_ids:
             channel = self._subscriptions.pop(number, None)
             if channel is not None:
+                self._subscribed.remove(channel)
                 self._network.channels.by_number[channel].unsubscribe(self.client)
 
     # Publishing and calling
@@ -140,7 +172,7 @@ class FoxgloveSession:
             return
         for each in message.channels:
             if each.id in self._publications:
-                self.status(StatusLevel.WARNING, f"channel {each.id} is advertised already: ignored")
+                self._complain(StatusLevel.WARNING, f"channel {each.id} is advertised already: ignored")
             elif len(self._publications) >= CHANNELS_MAX:
                 self._refuse("too many channels", f"{each.topic}: a client may publish on {CHANNELS_MAX} channels")
             else:
@@ -153,7 +185,7 @@ class FoxgloveSession:
         for number in message.channel_ids:
             publication = self._publications.pop(number, None)
             if publication is None:
-                self.status(StatusLevel.WARNING, f"channel {number} is not advertised: ignored")
+                self._complain(StatusLevel.WARNING, f"channel {number} is not advertised: ignored")
             else:
                 self._network.publications.close(publication)
 

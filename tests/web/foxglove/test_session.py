@@ -18,6 +18,7 @@ from r2p.ros.cdr import cdr
 from r2p.ros.topics import ros_class
 from r2p.testing.network import Network, node_in
 from r2p.web.foxglove import session
+from r2p.web.foxglove.session import MISTAKES_MAX
 from tests.web.foxglove.rig import Viewer, serving, until, viewer
 
 if TYPE_CHECKING:
@@ -419,6 +420,26 @@ async def test_no_bytes_end_a_session(messages: list[bytes]) -> None:
             one.send(each)
         one.say("fetchAsset", uri="", requestId=1)
         await until(lambda: one.binary(4))
+
+
+async def test_a_flood_of_mistakes_is_counted_and_keeps_no_other_viewer_waiting() -> None:
+    network = Network()
+    async with (
+        network.node("A") as node,
+        network.module("PC", observer=True) as pc,
+        serving(pc) as server,
+        viewer(server) as bad,
+        viewer(server) as good,
+    ):
+        texts = node.advertise("text", Text)
+        await until(lambda: "/text" in good.channels)
+        bad.say("subscribe", subscriptions=[{"id": 1, "channelId": 1 << 20}] * 10_000)
+        bad.say("subscribe", subscriptions=[{"id": 1, "channelId": good.channels["/text"]["id"]}] * 10_000)
+        good.subscribe("/text", 1)
+        await texts.wait_subscriber()
+        await texts.publish(Text("still here"))
+        await until(lambda: good.data and server.refused["unknown channel"] == 10_000)
+        assert len(bad.status) <= MISTAKES_MAX
 
 
 async def test_a_viewer_that_reads_nothing_is_disconnected_when_its_answers_do_not_fit(
