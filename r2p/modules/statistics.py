@@ -192,7 +192,7 @@ def collect(manager: LinkManager, supervisors: Mapping[str, Supervisor]) -> Modu
         ),
         publishers=_limited(
             PublisherStatistics(each.topic, node.name, int(each.publisher_class), each.sent, each.missed, each.late)
-            for node in nodes
+            for node in _with_own(nodes, manager)
             for each in node.publishers
         ),
         subscribers=_limited(_of_subscriber(node, each) for node in nodes for each in node.subscribers),
@@ -203,6 +203,12 @@ def collect(manager: LinkManager, supervisors: Mapping[str, Supervisor]) -> Modu
         topics=_limited(_of_topic(manager, topic, each) for topic, each in remote),
         forwarded=_forwarded(manager),
     )
+
+
+def _with_own(nodes: Iterable[Node], manager: LinkManager) -> dict[Node, None]:
+    """Return nodes, and those with which the module itself publishes: its log, and what it says of buses."""
+    publishers = (each for topic in manager.space.topics.values() for each in topic.publishers)
+    return dict.fromkeys((*nodes, *(each.node for each in publishers if isinstance(each.node, Node))))
 
 
 def _of_subscriber(node: Node, each: Subscriber[Any]) -> SubscriberStatistics:

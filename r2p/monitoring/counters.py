@@ -59,6 +59,8 @@ class ModuleCounters:
 
     def __init__(self) -> None:
         self.answers: bool | None = None
+        self.has_rates = False
+        """Whether it has answered twice since it began, or since it was silent."""
         self.left_out = 0
         """Entries of the last answer for which there was no room."""
         self.entries = 0
@@ -83,7 +85,7 @@ class ModuleCounters:
 
     def silence(self, _reason: str = "") -> None:
         """Note that the module does not answer: totals stay, rates are unknown."""
-        self.answers = False
+        self.answers = self.has_rates = False
         self.cpu = None
         self._rates.clear()
         self._time = None
@@ -94,6 +96,7 @@ class ModuleCounters:
     def update(self, module: str, statistics: ModuleStatistics, room: int) -> None:
         """Enter an answer, of which at most `room` entries are kept."""
         time = statistics.uptime
+        self.has_rates = self._time is not None
         restarted = self._time is not None and time < self._time
         if restarted:
             self._rates.clear()

@@ -38,7 +38,10 @@ _MODULES_MAX = 256  # modules that are asked: their names come from the network
 _ENTRIES_MAX = 50_000  # entries that are kept of all answers
 _ENTRIES_PER_SECOND = 2_000  # of answers, which take about 60 messages: a larger network is asked less often
 _AT_ONCE = 200  # topics in one turn of the event loop
-_SHARE = 20  # times as long as collecting takes, it rests: a network of any size takes a twentieth of the loop
+_EARLY = 0.25  # s between two looks at first: a person waits for what is there ...
+_EARLY_MIN, _EARLY_MAX = 2.0, 4.0  # s, ... for the former, and until rates are known, but no longer than the latter
+_SHARE = 20  # times as long as collecting takes, it rests: a network of any size takes a twentieth of the loop, ...
+_SHARE_EARLY = 4  # ... and more at first, when it takes long as all is new
 
 logger = get_logger("r2p.monitoring")
 
@@ -46,8 +49,9 @@ logger = get_logger("r2p.monitoring")
 class NetworkMonitor:
     """Collects figures while its block is open: `snapshot` is the newest, and `changed()` waits for the next one.
 
-    Modules are asked for their statistics each `period` (s), and less often where answers are slow. Collecting takes
-    short turns in the event loop, whatever the number of topics.
+    Modules are asked for their statistics each `period` (s), and less often where answers are slow. In its first
+    seconds, until rates are known, it looks four times a second at what is there. Collecting takes short turns in the
+    event loop, whatever the number of topics.
     """
 
     def __init__(self, module: Module, *, period: float = 1.0, types: TypeFinder | None = None) -> None:
@@ -66,9 +70,12 @@ class NetworkMonitor:
         self._polling = StatisticsPolling(module, period)
         self._polls: dict[str, asyncio.Task[None]] = {}
         self._learning: asyncio.Task[None] | None = None
+        self._is_early = True
+        self._opened_at = 0
 
     async def __aenter__(self) -> Self:
         """Begin to collect. Raises Closed if the module is not open."""
+        self._opened_at = self._clock.monotonic()
         await self._collect()
         self._task = asyncio.create_task(self._run(), name=f"{self._module.name} monitor")
         return self
@@ -90,6 +97,15 @@ class NetworkMonitor:
     async def changed(self) -> NetworkSnapshot:
         """Wait for the next figures, and return them."""
         await self._changed.wait()
+        return self.snapshot
+
+    async def ready(self) -> NetworkSnapshot:
+        """Wait until the rates of all modules that answer are known, for a few seconds at most, and return the figures.
+
+        What is not announced yet is not waited for.
+        """
+        while self._is_early:
+            await self.changed()
         return self.snapshot
 
     # Measured topics
@@ -124,7 +140,10 @@ class NetworkMonitor:
     async def _run(self) -> None:
         took = 0.0
         while True:
-            await asyncio.sleep(max(self._period, _SHARE * took))
+            if self._is_early:
+                await asyncio.sleep(max(min(self._period, _EARLY), _SHARE_EARLY * took))
+            else:
+                await asyncio.sleep(max(self._period, _SHARE * took))
             started = self._clock.monotonic()
             try:
                 await self._collect()
@@ -158,8 +177,15 @@ class NetworkMonitor:
             buses=keep_equal(before.buses, buses),
             topics_left_out=left_out,
         )
+        self._is_early = self._is_early and self._has_just_begun()
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
+
+    def _has_just_begun(self) -> bool:
+        """Return whether modules may still be announced, or one that answers has not said rates yet."""
+        since = (self._clock.monotonic() - self._opened_at) / SECOND
+        answering = (each for each in self._sources.counters.values() if each.answers is not False)
+        return since < _EARLY_MIN or (since < _EARLY_MAX and not all(each.has_rates for each in answering))
 
     def _is_own_wish(self, view: TopicView) -> bool:
         """Return whether only this tool would have the topic: what a bus reports, if there is one."""

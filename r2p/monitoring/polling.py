@@ -2,7 +2,7 @@
 
 A module whose answer takes long is asked less often. On RTCAN, on serial lines, and behind gateways, answers take
 capacity from the robot: there a module whose answer takes longer than 5 ms is asked less often than once a second, and
-each 10 s if it takes 50 ms or more.
+each 10 s if it takes 50 ms or more. Only the second question follows soon on the first: a rate needs two answers.
 """
 
 import asyncio
@@ -25,6 +25,7 @@ _NEAR_AT_ONCE = 4  # modules: together they answer as fast as a link takes answe
 _REST = 1  # times as long as an answer took, nothing is asked ...
 _REST_SLOW = 200  # ... where links may be slow, whose capacity is for the robot ...
 _PERIOD_SLOW = 10.0  # s, ... but no longer than this, or than the former
+_REST_FIRST = 4  # times as long as the first answer took, nothing is asked: the second one says rates
 
 
 def can_be_asked(view: ModuleView) -> bool:
@@ -49,6 +50,10 @@ class QuestionPace:
         if not self.is_near():
             rest = max(rest, min(_REST_SLOW * self.took, _PERIOD_SLOW))
         await asyncio.sleep(max(period, rest))
+
+    async def pause_first(self) -> None:
+        """Wait after the first answer: a second one is needed for rates, so it is asked for soon."""
+        await asyncio.sleep(max(PERIOD, _REST_FIRST * self.took))
 
     def is_near(self) -> bool:
         """Return whether a fast link leads to the module, without a gateway in between."""
@@ -76,6 +81,7 @@ class StatisticsPolling:
     ) -> None:
         """Ask a module again and again, until cancelled; `on_silence` gets the reason of a failure."""
         pace = QuestionPace(self._module, name)
+        is_first = True
         while True:
             try:
                 statistics = await self._ask(name, pace)
@@ -83,10 +89,12 @@ class StatisticsPolling:
                 return
             except (Error, TimeoutError) as error:
                 on_silence(str(error))
+                is_first = True
                 await pace.pause(RETRY)
             else:
                 on_answer(statistics)
-                await pace.pause(self.period)
+                await (pace.pause_first() if is_first else pace.pause(self.period))
+                is_first = False
 
     async def _ask(self, name: str, pace: QuestionPace) -> ModuleStatistics:
         if name == self._module.name:

@@ -59,11 +59,9 @@ command = joined(graph)
 
 
 async def _figures(session: Session) -> dict[str, TopicFigures]:
-    """Return the figures of topics after two periods: one to learn whom to ask, and one for the growth of counters."""
+    """Return the figures of topics, when rates are known."""
     async with NetworkMonitor(session.module) as monitor:
-        await monitor.changed()
-        await monitor.changed()
-        return {each.name: each for each in (await monitor.changed()).topics}
+        return {each.name: each for each in (await monitor.ready()).topics}
 
 
 def _topics(

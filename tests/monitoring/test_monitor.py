@@ -9,6 +9,7 @@ import pytest
 import r2p
 from r2p.codecs import rtcan
 from r2p.monitoring.monitor import NetworkMonitor
+from r2p.monitoring.polling import can_be_asked
 from r2p.monitoring.snapshot import ModuleFigures, NetworkSnapshot, TopicFigures
 from r2p.msg import Led, String
 from r2p.testing.network import Network, node_in
@@ -115,6 +116,23 @@ async def test_a_module_that_does_not_answer_has_unknown_rates_and_a_measured_on
 
 def _module(snapshot: NetworkSnapshot, name: str) -> ModuleFigures:
     return next((each for each in snapshot.modules if each.name == name), ModuleFigures(name, "", "", 0.0))
+
+
+async def test_rates_are_there_after_seconds_also_where_answers_are_slow() -> None:
+    network = Network(delay=0.15)  # an answer takes 0.3 s: afterwards it is asked for each 10 s
+    async with network.module("ARM") as arm, node_in(arm) as node, network.module("PC", observer=True) as pc:
+        node.advertise("joint", Led, r2p.Periodic(0.01, Led))
+        await until(lambda: _is_known(pc, "ARM"))
+        started = asyncio.get_running_loop().time()
+        async with NetworkMonitor(pc) as monitor:
+            snapshot = await monitor.ready()
+            assert asyncio.get_running_loop().time() - started < 3.0
+            assert topic(snapshot, "joint").rate == pytest.approx(100.0, abs=1.1)
+            assert topic(snapshot, "log").rate == 0.0  # which the module itself publishes
+
+
+def _is_known(module: r2p.Module, name: str) -> bool:
+    return any(each.name == name and can_be_asked(each) for each in module.network.modules())
 
 
 async def test_a_module_that_restarts_and_a_publisher_that_comes_anew_keep_true_rates() -> None:

@@ -20,7 +20,7 @@ class BusPanel(TextLines):
     def show_bus(self, bus: BusFigures | None, which: str) -> None:
         """Show a bus; `which`: its number among the buses. None: there is none."""
         if bus is None:
-            self.show("no figures of a bus: they come from bus_load and bus_slots, of an r2p module on a CAN bus")
+            self.show("no figures of a bus yet: they come from bus_load and bus_slots, of an r2p module on a CAN bus")
         else:
             self.show(*bus_lines(bus, which, self.size.width or 80))
 

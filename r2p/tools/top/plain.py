@@ -19,12 +19,15 @@ class PlainTop:
         self._wanted = wanted
 
     async def run(self, monitor: NetworkMonitor, count: int | None) -> None:
-        """Print `count` tables, or without end. The first one comes after a period: rates need two looks."""
+        """Print `count` tables, or without end. The first one comes after a few seconds, when rates are known."""
         printed = 0
         async with self._output.while_read():
+            snapshot = await monitor.ready()
             while printed != count:
-                await self.put(await monitor.changed())
+                await self.put(snapshot)
                 printed += 1
+                if printed != count:
+                    snapshot = await monitor.changed()
 
     async def put(self, snapshot: NetworkSnapshot) -> None:
         """Print the table of a snapshot."""

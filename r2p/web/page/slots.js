@@ -17,8 +17,9 @@ export const slots = {
   create(app) {
     const buses = h("div", { class: "buses" })
     const empty = h("div", { class: "empty" },
-      h("p", {}, "No RTCAN bus is known."),
-      h("p", {}, "A bus is shown where this tool is on it, or a module of it publishes bus_load and bus_slots."))
+      h("p", {}, "No RTCAN bus is known yet."),
+      h("p", {}, "A bus is shown where this tool is on it, or a module of it publishes bus_load and bus_slots: " +
+        "the first figures take up to 3 s."))
     const drawn = new Map()
     let paused = false
     const draw = () => {
