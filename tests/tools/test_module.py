@@ -85,7 +85,8 @@ async def test_what_a_module_has_counted(capsys: pytest.CaptureFixture[str]) -> 
         (record,) = printed(capsys)
         assert (record["module"], record["state"], record["kind"]) == ("BOT", "running", "r2p")
         assert record["publishers"] == [
-            {"topic": "leds", "node": "hold", "publisher_class": 1, "sent": 0, "missed": 0, "late": 0}
+            {"topic": name, "node": node, "publisher_class": 1, "sent": 0, "missed": 0, "late": 0}
+            for name, node in (("leds", "hold"), ("log", "log"))
         ]
         assert record["links"][0]["lost"] == {}
         assert record["nodes"] == [{"node": "hold", "running": True, "restarts": 0}]
