@@ -50,6 +50,7 @@ class WebClient:
         self._has_room = asyncio.Event()
         self._has_room.set()
         self._closing: asyncio.Task[None] | None = None
+        self._left = False
 
     async def __aenter__(self) -> Self:
         self._writer = asyncio.create_task(self._write())
@@ -74,7 +75,7 @@ class WebClient:
         A message of a `stream` may be dropped for newer ones when the client is too slow, which counts as `amount`. One
         without a stream is never dropped: a client that does not read these is disconnected.
         """
-        if self._closing is not None:
+        if self._closing is not None or self._left:
             return False
         size = sys.getsizeof(message) + _MESSAGE_BYTES  # a text with one emoji has four bytes for each character
         self._count += 1
@@ -156,4 +157,5 @@ class WebClient:
         except ConnectionClosed:
             return
         finally:
+            self._left = True
             self._has_room.set()

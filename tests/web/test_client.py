@@ -54,6 +54,18 @@ async def test_answers_and_streams_keep_their_order() -> None:
         assert connection.sent == [f"{number}" for number in range(8)]
 
 
+async def test_what_is_sent_to_a_client_that_has_left_is_not_kept() -> None:
+    async with client_that_reads_nothing() as (client, connection):
+        client.send(_LARGE)
+        await connection.close(1001, "")
+        connection.reads.set()
+        await asyncio.sleep(1)
+        for _ in range(100):
+            client.send(_LARGE)
+        await client.room()
+        assert not client._queue
+
+
 async def test_a_text_counts_with_the_memory_that_it_takes() -> None:
     async with client_that_reads_nothing() as (client, _):
         client.send("\N{ROBOT FACE}" * 1000, "log")

@@ -7,9 +7,11 @@ While there are clients, it looks at the network twice a second; it subscribes t
 """
 
 import asyncio
+import itertools
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeVar
 
 from r2p.clock import real_time, sleep_in_background
 from r2p.errors import Closed
@@ -30,9 +32,12 @@ from r2p.web.server import WebEndpoint
 ORIGINS = ("https://app.foxglove.dev", "file://")
 """Pages that may connect: Foxglove in a browser, and the programs Foxglove and Lichtblick, whose pages are files."""
 
+E = TypeVar("E")
+
 logger = get_logger("r2p.web")
 
 _REVIEW = 0.5  # seconds
+_PART = 16  # channels or services of one message, each with its schema: all at once may not fit a client's queue
 _TIME = "time"  # the stream of times, which lacks nothing but older ones
 _TICK = 0.02  # seconds between two times of a clock that is not UTC
 _DISTRO = "jazzy"  # viewers take their definitions of ROS's common types by it
@@ -84,29 +89,32 @@ class FoxgloveServer:
         session = FoxgloveSession(self.network, client)
         if not self.sessions:
             self.network.review()
-        self._greet(client)
-        self.sessions.append(session)
+        self.sessions.append(session)  # what comes and goes from now on is sent to it
         try:
+            await self._greet(client)
             await session.run()
         finally:
             self.sessions.remove(session)
             self.lost.update({name: count for name, count in client.dropped.items() if name != _TIME})
 
-    def _greet(self, client: WebClient) -> None:
-        """Send what is there: the server, its channels and services, and what is wrong with them."""
+    async def _greet(self, client: WebClient) -> None:
+        """Send what is there: the server, its channels and services, and what is wrong with them.
+
+        It is sent in parts, as fast as the client reads.
+        """
         names = self._capabilities()
         encodings = (protocol.CDR, protocol.JSON)
         metadata = {"r2p": __version__, "ROS_DISTRO": _DISTRO}
         client.send(protocol.server_info(self._options.name, names, encodings, metadata, self._session_id))
-        channels = [*self.network.channels.by_number.values()]
-        services = [*self.network.services.by_number.values()]
-        if channels:
+        for channels in _parts(self.network.channels.by_number):
+            await client.room()
             client.send(protocol.advertise(each.info for each in channels))
-        if services:
+            for each in channels:
+                if each.problem:
+                    client.send(_problem(each))
+        for services in _parts(self.network.services.by_number):
+            await client.room()
             client.send(protocol.advertise_services(each.info for each in services))
-        for each in channels:
-            if each.problem:
-                client.send(_problem(each))
 
     def _capabilities(self) -> list[str]:
         names = ["parameters", "parametersSubscribe", "connectionGraph"]
@@ -184,6 +192,14 @@ class FoxgloveServer:
             for session in self.sessions:
                 session.client.send_newest(now, _TIME)
             await sleep_in_background(_TICK)
+
+
+def _parts(by_number: Mapping[int, E]) -> Iterator[list[E]]:
+    """Yield what there is now, a few at a time, without what has gone since."""
+    numbers = iter([*by_number])
+    while part := [*itertools.islice(numbers, _PART)]:
+        if found := [by_number[number] for number in part if number in by_number]:
+            yield found
 
 
 def _problem_id(channel: Channel) -> str:

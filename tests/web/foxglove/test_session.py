@@ -422,6 +422,19 @@ async def test_no_bytes_end_a_session(messages: list[bytes]) -> None:
         await until(lambda: one.binary(4))
 
 
+async def test_a_viewer_gets_all_of_a_large_network_as_fast_as_it_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("r2p.web.client.ANSWERS_BYTES", 200_000)
+    network = Network()
+    async with network.node("A") as node, network.module("PC", observer=True) as pc, serving(pc) as server:
+        for number in range(200):
+            node.advertise(f"robot{number}/odometry", r2p.msg.Odometry)
+        async with viewer(server) as first:
+            await until(lambda: len(first.channels) > 200)
+        async with viewer(server) as one:
+            await until(lambda: len(one.channels) > 200)
+            assert one.connection.closed is None
+
+
 async def test_a_flood_of_mistakes_is_counted_and_keeps_no_other_viewer_waiting() -> None:
     network = Network()
     async with (
