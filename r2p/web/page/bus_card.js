@@ -1,15 +1,13 @@
 // One RTCAN bus: its load by topic, against what is reserved for slots.
 
+import { kindClass, kindName, LoadBar } from "./bus_load.js"
 import { h, setText } from "./dom.js"
 import { count, fixed, milliseconds, percent } from "./format.js"
 import { LiveTable } from "./table.js"
 
-const KINDS = { hrt: "hard real-time, in slots", srt: "soft real-time", nrt: "non real-time", management: "management", sync: "sync" }
-
 const COLUMNS = [
-  { id: "topic", title: "Topic", value: row => row.topic || row.kind, text: row => row.topic || row.kind,
-    draw: (cell, row) => drawName(cell, row) },
-  { id: "kind", title: "Kind", value: row => row.kind, tone: () => "dim" },
+  { id: "topic", title: "Topic", value: nameOf, draw: drawName },
+  { id: "kind", title: "Kind", value: row => kindName(row.kind), tone: () => "dim" },
   { id: "module", title: "Module", level: 2, value: row => row.module || null },
   { id: "slots", title: "Slots", number: true, level: 2, hint: "Slots of the cycle that are reserved for it",
     value: row => row.slots ?? null },
@@ -17,18 +15,22 @@ const COLUMNS = [
   { id: "share", title: "Load", unit: "%", number: true, value: row => row.share, text: row => percent(row.share, 2) },
 ]
 
+function nameOf(row) {
+  return row.topic || kindName(row.kind)
+}
+
 function drawName(cell, row) {
   const swatch = cell.querySelector(".swatch") ?? cell.appendChild(h("span", { "aria-hidden": "true" }))
-  swatch.className = `swatch kind-${KINDS[row.kind] ? row.kind : "other"}`
+  swatch.className = `swatch ${kindClass(row.kind)}`
   const name = cell.querySelector(".bus-topic") ?? cell.appendChild(h("span", { class: "bus-topic" }))
-  setText(name, row.topic || row.kind)
+  setText(name, nameOf(row))
 }
 
 export class BusCard {
   #name = h("h3", {})
   #load = h("strong")
   #facts = h("span", { class: "dim" })
-  #meter = h("div", { class: "meter", role: "img" })
+  #bar = new LoadBar()
   #table = new LiveTable({
     id: "bus", caption: "Load of the bus by topic", columns: COLUMNS, key: row => `${row.kind} ${row.topic} ${row.module}`,
     sort: "-share", empty: "The bus has not said what its topics take",
@@ -39,7 +41,7 @@ export class BusCard {
     const details = h("details", {}, h("summary", {}, "Load by topic"), this.#table.element)
     details.open = matchMedia("(min-width: 721px)").matches
     this.element = h("article", { class: "bus" },
-      h("div", { class: "head" }, this.#name, this.#load, this.#facts), this.#meter, details)
+      h("div", { class: "head" }, this.#name, this.#load, this.#facts), this.#bar.element, details)
   }
 
   update(bus) {
@@ -48,29 +50,9 @@ export class BusCard {
     setText(this.#name, bus.name)
     setText(this.#load, `${percent(bus.share)} % used`)
     setText(this.#facts, facts(bus))
-    this.#drawMeter(bus)
+    this.#bar.update(bus)
     const slots = new Map((bus.slots ?? []).map(each => [`${each.topic} ${each.module}`, each.slots.length]))
     this.#table.update((bus.topics ?? []).map(row => ({ ...row, slots: slots.get(`${row.topic} ${row.module}`) })))
-  }
-
-  // A bar of what each kind takes, and a line where the budget ends that is admitted for slots.
-  #drawMeter(bus) {
-    const shares = new Map()
-    for (const { kind, share } of bus.topics ?? []) shares.set(kind, (shares.get(kind) ?? 0) + share)
-    const kinds = [...Object.keys(KINDS).filter(kind => shares.has(kind)), ...[...shares.keys()].filter(kind => !KINDS[kind])]
-    const parts = kinds.map(kind => {
-      const part = h("span", { class: `part kind-${KINDS[kind] ? kind : "other"}`, title: `${KINDS[kind] ?? kind}: ${percent(shares.get(kind))} %` })
-      part.style.width = `${100 * shares.get(kind)}%`
-      return part
-    })
-    if (bus.reserved !== undefined) {
-      const budget = h("span", { class: "budget", title: `Reserved for slots: ${percent(bus.reserved)} %` })
-      budget.style.left = `${Math.min(100, 100 * bus.reserved)}%`
-      parts.push(budget)
-    }
-    this.#meter.replaceChildren(...parts)
-    this.#meter.setAttribute("aria-label",
-      `${percent(bus.share)} % used: ${kinds.map(kind => `${KINDS[kind] ?? kind} ${percent(shares.get(kind))} %`).join(", ")}`)
   }
 }
 

@@ -16,7 +16,7 @@ export const log = {
   create: app => new LogView(app),
 }
 
-export function levelName(level) {
+function levelName(level) {
   return LEVELS.findLast(([least]) => level >= least)?.[1] ?? "DEBUG"
 }
 

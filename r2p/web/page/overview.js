@@ -29,7 +29,7 @@ function describeLost(counters) {
   return Object.entries(counters ?? {}).map(([reason, size]) => `${reason} ${size}`).join(", ")
 }
 
-export const TOPIC_COLUMNS = [
+const TOPIC_COLUMNS = [
   { id: "name", title: "Topic", value: row => row.name, link: row => `#/overview/topic/${encodeURIComponent(row.name)}` },
   { id: "type", title: "Type", level: 4, value: row => row.type, tone: row => row.mismatch ? "bad" : "dim",
     text: row => row.mismatch ? `${row.type ?? ""} types differ` : row.type },

@@ -1,14 +1,11 @@
 // The slots of RTCAN buses: who owns which, which are free or reserved and not used, and the load against the budget.
 
+import { kindName, LoadBar, sharesOf } from "./bus_load.js"
 import { h, pauseButton, setText } from "./dom.js"
 import { count, fixed, milliseconds, percent, plural, UNKNOWN } from "./format.js"
 import { LiveTable } from "./table.js"
 
 const COLOURS = 8
-const KINDS = ["sync", "hrt", "srt", "nrt", "management", "other"]
-const KIND_NAMES = {
-  sync: "sync", hrt: "periodic", srt: "sporadic", nrt: "non real-time", management: "management", other: "not RTCAN",
-}
 const FREE_USED_MAX = 0.8 // of the free slots; beyond it events wait long (r2p.msg.BusTraffic)
 
 export const slots = {
@@ -52,7 +49,7 @@ export const slots = {
 }
 
 // Return the owner of each slot of a cycle: {topic, module, state: "sync", "owned", "reserved" or "free"}.
-export function cellsOf(bus) {
+function cellsOf(bus) {
   const free = { state: "free", topic: "", module: "", others: 0 }
   const cells = Array(bus.slots_in_cycle ?? 0).fill(free)
   for (const owner of bus.slots ?? []) {
@@ -71,20 +68,20 @@ function stateOf(slot, owner) {
 }
 
 // Return a row for each topic of each module on a bus: what it takes, and what is reserved for it.
-export function rowsOf(bus) {
+function rowsOf(bus) {
   const rows = new Map()
   for (const each of bus.topics ?? []) {
     const isOfUsers = !["sync", "management"].includes(each.kind)
     const topic = isOfUsers ? each.topic : ""
     const key = `${each.module} ${topic || each.kind}`
-    const kind = KIND_NAMES[each.kind] ?? each.kind
+    const kind = kindName(each.kind)
     rows.set(key, { key, kind, topic, module: each.module, share: each.share, frames: each.frames })
   }
   for (const { topic, module, slots: owned } of bus.slots ?? []) {
     if (!topic || !owned?.length) continue
     const isSync = owned[0] === 0
     const key = `${module} ${isSync ? "sync" : topic}`
-    const row = rows.get(key) ?? { key, kind: KIND_NAMES[isSync ? "sync" : "hrt"], topic: isSync ? "" : topic, module }
+    const row = rows.get(key) ?? { key, kind: kindName(isSync ? "sync" : "hrt"), topic: isSync ? "" : topic, module }
     rows.set(key, { ...row, slots: owned, reserved: bus.slots_in_cycle ? owned.length / bus.slots_in_cycle : null })
   }
   return [...rows.values()]
@@ -136,7 +133,7 @@ class BusPicture {
   #colours = new Colours()
   #facts = h("p", { class: "dim" })
   #cells = h("ol", { class: "slots" })
-  #bar = h("div", { class: "load", role: "img" })
+  #bar = new LoadBar()
   #load = h("p", { class: "dim" })
   #hint = h("p", { class: "hint", hidden: true },
     "The slots of this bus are not known: no module of it publishes bus_slots.")
@@ -152,7 +149,7 @@ class BusPicture {
     })
     this.#cells.setAttribute("aria-label", `Slots of the cycle of ${name}`)
     this.element = h("section", { class: "panel bus", dataset: { bus: name }, "aria-label": `Bus ${name}` },
-      h("div", { class: "head" }, h("h2", {}, name), this.#facts), this.#bar, this.#load, this.#warning,
+      h("div", { class: "head" }, h("h2", {}, name), this.#facts), this.#bar.element, this.#load, this.#warning,
       this.#hint, this.#cells, this.#said, key(), this.#table.element)
     for (const event of ["pointerover", "focusin"]) this.#cells.addEventListener(event, each => this.#say(each.target))
     this.#cells.addEventListener("pointerleave", () => this.#say(null))
@@ -173,15 +170,8 @@ class BusPicture {
   }
 
   #drawLoad(bus) {
-    const kinds = KINDS.map(kind => [kind, (bus.topics ?? []).filter(each => each.kind === kind)
-      .reduce((sum, each) => sum + each.share, 0)]).filter(([, share]) => share > 0)
-    this.#bar.replaceChildren(...kinds.map(([kind, share]) => {
-      const part = h("span", { class: `part kind-${kind}`, title: `${KIND_NAMES[kind]}: ${percent(share)} %` })
-      part.style.width = `${Math.min(100, 100 * share)}%`
-      return part
-    }), ...(bus.reserved === undefined ? [] : [mark(bus.reserved)]))
-    this.#bar.setAttribute("aria-label", `Load ${percent(bus.share)} %, reserved for slots ${percent(bus.reserved)} %`)
-    const parts = kinds.map(([kind, share]) => `${KIND_NAMES[kind]} ${percent(share)} %`)
+    this.#bar.update(bus)
+    const parts = sharesOf(bus).map(([kind, share]) => `${kindName(kind)} ${percent(share)} %`)
     setText(this.#load, [
       `Load ${percent(bus.share)} %`, `reserved for slots ${percent(bus.reserved)} %`,
       `free slots used ${percent(bus.free_used)} %`, ...parts,
@@ -214,12 +204,6 @@ class BusPicture {
     }
     setText(this.#said, slot?.title ?? "")
   }
-}
-
-function mark(share) {
-  const line = h("span", { class: "mark", title: `reserved for slots: ${percent(share)} %` })
-  line.style.left = `${Math.min(100, 100 * share)}%`
-  return line
 }
 
 function factsOf(bus) {

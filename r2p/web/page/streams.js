@@ -6,7 +6,7 @@ const RETRY = 5_000 // ms
 
 let numbers = 0
 
-export function topicOf(name) {
+function topicOf(name) {
   return name.split(".", 1)[0]
 }
 
