@@ -8,6 +8,7 @@ last of them. Booleans and enums are numbers; an element that an array lacks is 
 
 import itertools
 import math
+import operator
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
@@ -185,7 +186,8 @@ def _fixed(shape: Layout[Any], wanted: Sequence[Steps]) -> tuple[Callable[[bytes
     """Return the function that reads all numbers at once, and the place of each in what it returns."""
     found = {steps: _place(Nested(shape), steps) for steps in wanted}
     numbers = sorted(found.values(), key=_offset)
-    places = {steps: numbers.index(number) for steps, number in found.items()}
+    rows = {offset: place for place, (offset, _) in enumerate(numbers)}
+    places = {steps: rows[offset] for steps, (offset, _) in found.items()}
     return struct.Struct(_format(numbers, shape.size)).unpack, places
 
 
@@ -280,8 +282,9 @@ class _ExtractorSource:
                 self._add_each(item, str(count), wanted)
 
     def _add_fields(self, fields: tuple[Field, ...], wanted: Wanted) -> None:
+        inside = _by_step(wanted)
         for field in fields:
-            self.add(field.shape, _inside(wanted, field.name))
+            self.add(field.shape, inside.get(field.name, {}))
 
     def _add_fixed(self, shape: Shape, wanted: Wanted) -> None:
         numbers, slots = self._places(shape, wanted)
@@ -298,10 +301,10 @@ class _ExtractorSource:
     def _add_elements(self, item: Shape, limit: int, wanted: Wanted) -> None:
         """Add an array of elements of fixed size: the numbers of each wanted element by one struct."""
         self._add_count(limit, item.size)
-        for index in _indices(wanted):
+        for index, inside in _by_index(wanted):
             self._add_line(f"if n > {index}:")
             self._indent += 1
-            self._add_read(*self._places(item, _inside(wanted, index)), f"at + {index * item.size}")
+            self._add_read(*self._places(item, inside), f"at + {index * item.size}")
             self._indent -= 1
         self._add_line(f"at += n * {item.size}")
 
@@ -311,9 +314,9 @@ class _ExtractorSource:
         self._add_line(f"for {index} in range({count}):")
         self._indent += 1
         word = "if"
-        for each in _indices(wanted):
+        for each, inside in _by_index(wanted):
             self._add_line(f"{word} {index} == {each}:")
-            self._add_block(item, _inside(wanted, each))
+            self._add_block(item, inside)
             word = "elif"
         if wanted:
             self._add_line("else:")
@@ -353,11 +356,14 @@ class _ExtractorSource:
         self._lines.append("    " * self._indent + line)
 
 
-def _inside(wanted: Wanted, step: str | int) -> Wanted:
-    """Return what is wanted behind a step."""
-    return {steps[1:]: slot for steps, slot in wanted.items() if steps[0] == step}
+def _by_step(wanted: Wanted) -> dict[str | int, Wanted]:
+    """Return what is wanted behind each step."""
+    inside: dict[str | int, Wanted] = {}
+    for steps, slot in wanted.items():
+        inside.setdefault(steps[0], {})[steps[1:]] = slot
+    return inside
 
 
-def _indices(wanted: Wanted) -> list[int]:
-    """Return the elements of an array of which something is wanted."""
-    return sorted({int(steps[0]) for steps in wanted})
+def _by_index(wanted: Wanted) -> list[tuple[int, Wanted]]:
+    """Return the elements of an array of which something is wanted, in their order, and what that is."""
+    return sorted(((int(step), inside) for step, inside in _by_step(wanted).items()), key=operator.itemgetter(0))

@@ -30,6 +30,8 @@ from r2p.web.dash.source import raw_fields
 
 BATCH = 0.04
 """Seconds for which points are collected."""
+PATHS_MAX = 4096
+"""Fields of one topic that all pages together plot: their extractor is made anew for each plot that comes or goes."""
 WATCH_PERIOD = 0.1
 """Seconds between two messages of a watched topic, at least."""
 
@@ -70,8 +72,12 @@ class TopicFeeds:
         """Send points of a topic. Raises WebError for an unknown topic or type, MessageError for an unknown field."""
         cls = await self.find_type(topic)
         FieldExtractor(cls, stream.paths)
-        if not stream.closed:  # meanwhile
-            self._feed(topic).add_stream(stream, cls)
+        if stream.closed:  # meanwhile
+            return
+        feed = self._feed(topic)
+        if feed.paths_with(stream) > PATHS_MAX:
+            raise WebError(f"all pages together plot at most {PATHS_MAX} fields of {topic}: close some plots")
+        feed.add_stream(stream, cls)
 
     def stop_plot(self, topic: str, stream: PlotStream) -> None:
         """Send no more points."""
@@ -158,6 +164,10 @@ class TopicFeed:
     def add_stream(self, stream: PlotStream, cls: type[Message]) -> None:
         self._plots.streams.append(stream)
         self._plots.rebuild(cls)
+
+    def paths_with(self, stream: PlotStream) -> int:
+        """Return how many fields are plotted with one more stream."""
+        return len({path for each in (*self._plots.streams, stream) for path in each.paths})
 
     def remove_stream(self, stream: PlotStream) -> None:
         if stream in self._plots.streams:

@@ -91,6 +91,15 @@ async def test_thousands_of_plots_and_watches_are_refused_beyond_a_limit() -> No
         assert leds.subscribers == 1
 
 
+async def test_fields_of_one_topic_are_limited_over_all_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("r2p.web.dash.feeds.PATHS_MAX", 1)
+    async with robot() as (_, source), open_page(source) as page, open_page(source) as other:
+        await page.result("plot", stream=1, fields=["leds.led"])
+        await other.result("plot", stream=1, fields=["leds.led"])
+        error = await other.error("plot", stream=2, fields=["leds.value"])
+        assert error == "all pages together plot at most 1 fields of leds: close some plots"
+
+
 async def test_what_a_page_asked_for_ends_with_it() -> None:
     async with robot(publish=True) as (leds, source):
         async with open_page(source) as page:
