@@ -1,4 +1,4 @@
-"""What one module counts, as its last answers say: totals, and rates between two answers by the module's own clock.
+"""What one module counts, by its last answers: totals, and rates between two answers by the module's own clock.
 
 Names, numbers and times come from another module: names are made printable, sums stay within 64 bits, and a clock that
 goes back or is not a number only costs the rates.
@@ -29,7 +29,7 @@ from r2p.units import MILLISECOND, SECOND
 E = TypeVar("E")
 
 COUNT_MAX = (1 << 63) - 1
-"""Sums of what modules say may be greater, which JSON and others can't have."""
+"""The greatest count: sums over modules may be greater, which JSON and others can't have."""
 
 _PER_SECOND = MILLISECOND / SECOND
 _NONE: Mapping[str, int] = {}
@@ -238,7 +238,7 @@ _SUBSCRIBER_LOSSES = {"queue full": "lost", "undecodable": "undecodable", "too l
 
 
 def clamp(count: int) -> int:
-    """Return a sum of what modules say, within what JSON can have."""
+    """Return a sum over modules, within what JSON can have."""
     return min(count, COUNT_MAX)
 
 

@@ -86,7 +86,7 @@ class TopicFigures(Figures):
 
 
 class NodeFigures(Figures):
-    """A node of a module; None: its module does not say."""
+    """A node of a module; what its module does not report is None."""
 
     name: str
     running: bool | None = None

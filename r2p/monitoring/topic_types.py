@@ -38,7 +38,7 @@ class TypeFinder:
         self._asked_at: dict[_Key, int] = {}
 
     def close(self) -> None:
-        """Ask no more."""
+        """Stop asking."""
         for task in list(self._asking.values()):
             task.cancel()
 

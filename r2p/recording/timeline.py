@@ -60,7 +60,7 @@ KINDS: Final = {
 _KIND_OF_EVENT = {"no answer": "module", "answers": "module", "no master": "master", "events lost": "recorder"}
 _BASELINE = 11 * SECOND  # tables of slots are repeated every ten seconds
 ANSWER_WITHIN = 15 * SECOND
-"""In this time (ns) a module says again what it counts: on slow links it is asked each ten seconds."""
+"""Nanoseconds until a module has reported its counters again: on slow links it is asked every ten seconds."""
 _TOGETHER = SECOND  # ns in which the same events are joined
 _LOGGED_MISS = re.compile(r"topic (\S+)(?: \(.*?\))?: (.+) \(missed (\d+), late \d+ so far\)")
 
@@ -127,7 +127,7 @@ def _events(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
 
 
 def event_of(time: int, event: RecordedEvent) -> TimelineEvent:
-    """Return what a recorded event says; `time` is its log time."""
+    """Return a recorded event as one of the time line; `time` is its log time."""
     word = event.kind.partition(" ")[0]
     kind = _KIND_OF_EVENT.get(event.kind, word if word in KINDS else "notice")
     subject = event.module or event.topic if kind in ("module", "notice") else event.link
@@ -217,7 +217,7 @@ def _is_counted(time: int, answers: list[int]) -> bool:
 
 
 def signal_event(time: int, signal: RecordedSignal, reasons: MissReasons) -> TimelineEvent:
-    """Return what a signal says, with the reason that its module has logged."""
+    """Return the event of a signal, with the reason that its module has logged."""
     owner = f"{signal.module}/{signal.node}" if signal.node else signal.module
     about = f"{signal.topic} of {owner}" if signal.topic else f"link {signal.where} of {owner}"
     text = signal.reason
@@ -259,7 +259,7 @@ def _overdue(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent]:
 
 
 def overdue_event(info: ChannelInfo | None, time: int, sequence: int, data: bytes) -> TimelineEvent | None:
-    """Return the event of a message whose companion says that it came after its deadline; None if it did not."""
+    """Return the event of a message that came after its deadline, by its companion; None if it was in time."""
     try:
         meta = cdr(SampleMeta).decode(data)
     except DecodeError:

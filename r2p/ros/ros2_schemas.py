@@ -16,7 +16,7 @@ _TIMES = {
     **parse("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n"),
     **parse("builtin_interfaces/Duration", "int32 sec\nuint32 nanosec\n"),
 }
-"""What ROS 2 knows without its definition; a file has to say it."""
+"""Definitions that ROS 2 has built in, and that a file has to contain."""
 
 
 class Ros2Schema(msgspec.Struct, frozen=True):

@@ -357,4 +357,4 @@ def _response(status: http.HTTPStatus, file: WebFile) -> Response:
     return Response(status, status.phrase, headers, file.data)
 
 
-_quiet = logging.Logger("r2p.web.connections", logging.CRITICAL)  # what clients do wrong is no trouble of this program
+_quiet = logging.Logger("r2p.web.connections", logging.CRITICAL)  # errors of clients are not errors of this program

@@ -158,7 +158,7 @@ class RecentLosses:
         self._until |= dict.fromkeys(grown, snapshot.time + _RECENT)
 
     def alarm(self, row: Any) -> int:
-        """Return how much attention the row of a topic needs."""
+        """Return the attention that the row of a topic needs."""
         return ALARM if row.name in self._until else TOPICS.alarm(row)
 
 

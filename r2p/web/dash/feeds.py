@@ -80,7 +80,7 @@ class TopicFeeds:
         feed.add_stream(stream, cls)
 
     def stop_plot(self, topic: str, stream: PlotStream) -> None:
-        """Send no more points."""
+        """Stop sending points."""
         stream.closed = True
         if (feed := self._feeds.get(topic)) is not None:
             feed.remove_stream(stream)
@@ -92,7 +92,7 @@ class TopicFeeds:
         self._feed(topic).add_watch(client)
 
     def unwatch(self, topic: str, client: WebClient) -> None:
-        """Send a page no more messages of a topic."""
+        """Stop sending a page the messages of a topic."""
         if (feed := self._feeds.get(topic)) is not None:
             feed.remove_watch(client)
             self._release(feed)

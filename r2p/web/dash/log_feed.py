@@ -46,7 +46,7 @@ class PageLog:
             self.add(entry)
 
     def close(self) -> None:
-        """Send no more."""
+        """Stop sending."""
         if self._timer is not None:
             self._timer.cancel()
 
@@ -94,7 +94,7 @@ class LogFeed:
         page.begin(least, self._follower.records)
 
     async def remove(self, page: PageLog) -> None:
-        """Send a page no more records; without another page the subscription ends."""
+        """Stop sending a page records; the subscription ends with the last page."""
         page.close()
         if page in self._pages:
             self._pages.remove(page)

@@ -1,4 +1,4 @@
-"""What a page of `r2p dash` and its process tell each other, over one WebSocket at `/dash`.
+"""The protocol between a page of `r2p dash` and its process, over one WebSocket at `/dash`.
 
     page to process   a JSON object each: a request, with `op` and a number `id`
     process to page   a JSON object each: the answer, {"id": 3, "result": ...} or {"id": 3, "error": "why"}; or news,
@@ -65,7 +65,7 @@ class Plot(_Request, tag="plot"):
 
 
 class StopPlot(_Request, tag="stop_plot"):
-    """Send no more points of a stream."""
+    """Stop sending points of a stream."""
 
     stream: int
 
@@ -77,7 +77,7 @@ class Watch(_Request, tag="watch"):
 
 
 class Unwatch(_Request, tag="unwatch"):
-    """Send no more messages of a topic."""
+    """Stop sending messages of a topic."""
 
     topic: str
 
@@ -109,7 +109,7 @@ class Describe(_Request, tag="describe"):
 class Publish(_Request, tag="publish"):
     """Publish a message, once, or `rate` times a second until another one comes, it is stopped, or the page leaves.
 
-    The answer is {"subscribers": n}, to whom the first one went. `type` is for a topic that nobody has yet: the full
+    The answer is {"subscribers": n}, to whom the first one went. `type` is for a topic new to the network: the full
     name of one of r2p's standard types.
     """
 
@@ -209,7 +209,7 @@ DashRequest = (
 
 _decoder = msgspec.json.Decoder(DashRequest)
 encode = msgspec.json.Encoder().encode
-"""Encodes what the page is told: figures, `ParameterInfo` and plain values."""
+"""Encodes messages to the page: figures, `ParameterInfo` and plain values."""
 
 
 def decode(data: str | bytes) -> DashRequest:

@@ -72,7 +72,7 @@ class Channel:
             self._open(topic)
 
     def unsubscribe(self, client: WebClient) -> None:
-        """Send a client no more messages."""
+        """Stop sending a client the messages."""
         if self.clients.pop(client, None) is not None and not self.clients:
             for topic in list(self._subscribers):
                 self._close(topic)
@@ -230,7 +230,7 @@ class ChannelTable:
             self._transforms = None
 
     def close(self) -> None:
-        """End all subscriptions, and ask for no more types."""
+        """End all subscriptions, and stop asking for types."""
         for task in list(self._looking.values()):
             task.cancel()
         for channel in self.by_number.values():

@@ -64,7 +64,7 @@ class FoxgloveNetwork:
         self.parameters = NetworkParameters(module, changes.parameters_changed, changes.report_module)
 
     def review(self) -> None:
-        """Look which topics and services there are now."""
+        """Update channels and services by what is on the network now."""
         self._views = self._network.topics()
         self.channels.review(self._views)
         if self.options.allow_publish:

@@ -115,7 +115,7 @@ class NetworkParameters:
         return problems
 
     def _unknown(self, name: str) -> str:
-        """Say why there is no parameter to set."""
+        """Return why there is no parameter to set."""
         reason = next((text for module, text in self._silent.items() if _is_of(module, [name])), "")
         return f"{name} is not set: {reason}" if reason else f"there is no parameter {name}"
 
@@ -132,7 +132,7 @@ class NetworkParameters:
                 self._following[module] = task
 
     def unfollow(self) -> None:
-        """Ask no more."""
+        """Stop asking."""
         for task in self._following.values():
             task.cancel()
         self._following.clear()

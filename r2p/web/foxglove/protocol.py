@@ -37,7 +37,7 @@ _CUT = "..."
 
 
 class StatusLevel(enum.IntEnum):
-    """How bad it is what a status says."""
+    """The severity of a status."""
 
     INFO = 0
     WARNING = 1

@@ -116,7 +116,7 @@ class ServiceTable:
         return cdr(cls).encode(response)
 
     def close(self) -> None:
-        """End the clients, and ask for no more types."""
+        """End the clients, and stop asking for types."""
         for task in list(self._looking.values()):
             task.cancel()
         for name in list(self._by_name):

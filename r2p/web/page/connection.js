@@ -1,4 +1,4 @@
-// The connection to the process that serves this page: r2p/web/dash/protocol.py says what both tell each other.
+// The connection to the process that serves this page: r2p/web/dash/protocol.py has the protocol.
 
 const POINTS = 1
 const RETRY = 1_000 // ms, and then twice as long each time

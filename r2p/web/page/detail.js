@@ -1,4 +1,4 @@
-// What the details of a topic and of a module are made of.
+// Parts that the details of a topic and of a module share.
 
 import { h, setText } from "./dom.js"
 import { UNKNOWN } from "./format.js"

@@ -1,11 +1,11 @@
-// Toasts and dialogs: how the page says what went wrong, and how it asks.
+// Toasts and dialogs: errors, results, and questions to the user.
 
 import { button, h } from "./dom.js"
 
 const SHOWN = { good: 4_000, bad: 10_000 } // ms
 const TOASTS_MAX = 4
 
-// Say something at the edge of the page; `kind` is "good" or "bad".
+// Show a message at the edge of the page; `kind` is "good" or "bad".
 export function toast(text, kind = "good") {
   const list = document.getElementById("toasts")
   const same = [...list.children].find(each => each.dataset.text === text)
@@ -17,7 +17,7 @@ export function toast(text, kind = "good") {
   setTimeout(() => element.remove(), SHOWN[kind])
 }
 
-// Wait for a request, and say why it failed; `done` is said if it did not. Returns the result, or undefined.
+// Wait for a request, and show why it failed, or else `done`. Returns the result, or undefined.
 export async function attempt(promise, done = "") {
   try {
     const result = await promise

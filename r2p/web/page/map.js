@@ -1,4 +1,4 @@
-// The map: where topics with a pose say that robots are and have been.
+// The map: the positions and paths of robots, from topics with a pose.
 
 import { attempt, openDialog, toast } from "./dialogs.js"
 import { button, color, field, h, memory, oncePerFrame, setText } from "./dom.js"

@@ -6,7 +6,7 @@ import { count, duration, percent, plural, UNKNOWN } from "./format.js"
 
 const STATES = { running: "good", stopped: "warn", boot: "warn", observer: "" }
 
-// Orders to a module: the text of the button, what is asked, and what is said then.
+// Orders to a module: the text of the button, the question before it, and the message when it is done.
 const MODULE_ORDERS = {
   start: {
     text: "Start", danger: false,

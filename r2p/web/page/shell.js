@@ -1,4 +1,4 @@
-// What is around the views: navigation, the state of the connection, the theme, keys and help.
+// The frame around the views: navigation, the state of the connection, the theme, keys and help.
 
 import { openDialog, toast } from "./dialogs.js"
 import { button, h, setText } from "./dom.js"

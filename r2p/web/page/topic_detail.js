@@ -43,7 +43,7 @@ export class TopicDetail {
     if (topic === this.#row) return
     this.#row = topic
     if (this.#failed) this.#ask() // its type may be known now
-    if (!topic) return this.#facts.update([["State", "gone: nobody publishes or subscribes", "warn"]])
+    if (!topic) return this.#facts.update([["State", "gone: it has neither publishers nor subscribers", "warn"]])
     this.#facts.update(figures(topic))
     this.#offer(topic)
     this.#publishers.replaceChildren(publishersOf(topic))

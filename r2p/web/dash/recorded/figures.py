@@ -358,7 +358,7 @@ class _Instant:
             )
 
     def _age(self, module: str) -> float:
-        """Return the seconds since a module was heard; NaN, which JSON has as null, if that is not known."""
+        """Return the seconds since the last message of a module; NaN, which JSON has as null, if there is none."""
         answer = self._answers.get(module)
         heard = max(self._heard.get(module, 0), answer.time if answer is not None else 0)
         return (self._time - heard) / SECOND if heard else math.nan
