@@ -6,7 +6,8 @@ the robot's network. Files are no secret, so they need no token.
 
 What strangers cost is bounded. At most 128 connections are open, and 32 of them are clients. When one more comes, the
 oldest that has not become a client yet is closed: so thousands of sockets that send nothing keep no browser out. A
-request has 16 KiB and ten seconds; a client's messages wait in the socket when four of them are unread.
+request has 16 KiB and ten seconds; a client's messages wait in the socket when four of them are unread, and one that
+sends pings and does not read is disconnected.
 """
 
 import asyncio

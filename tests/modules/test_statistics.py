@@ -122,6 +122,16 @@ def test_any_bytes_are_statistics_or_a_decode_error(data: bytes, compressed: boo
         return
 
 
+GOLDEN = bytes.fromhex("78da63b46280811ff630162310b302714a5166592a2313036e000091ee0396")
+"""What a module answers that has run for 1.5 s, compressed."""
+
+
+def test_compressed_answers_of_other_programs_are_read() -> None:
+    known = r2p.ModuleStatistics(uptime=1.5, nodes=(r2p.NodeStatistics("drive", running=True, restarts=2),))
+    assert statistics.decode(GOLDEN) == known
+    assert zlib.decompress(GOLDEN) == statistics.encode(known)
+
+
 def test_compressed_answers_are_short_and_bounded() -> None:
     publishers = tuple(r2p.PublisherStatistics(f"arm/joint{number}", "arm", 1, number) for number in range(100))
     known = r2p.ModuleStatistics(publishers=publishers)
