@@ -22,7 +22,7 @@ from r2p.modules.statistics import (
     SubscriberStatistics,
 )
 from r2p.monitoring.rates import CounterRate
-from r2p.monitoring.snapshot import LinkFigures
+from r2p.monitoring.snapshot import CLASS_NAMES, LinkFigures
 from r2p.names import node_alias, topic_alias
 from r2p.units import MILLISECOND, SECOND
 
@@ -45,6 +45,7 @@ class PublisherCount(msgspec.Struct, frozen=True):
     missed: int
     late: int
     rate: float | None
+    publisher_class: str | None = None
 
 
 class SubscriberCount(msgspec.Struct, frozen=True):
@@ -167,13 +168,17 @@ class ModuleCounters:
         self, entries: Iterable[PublisherStatistics], before: dict[tuple[str, ...], CounterRate], time: float
     ) -> None:
         sums: dict[EndpointName, list[int]] = {}
+        classes: dict[EndpointName, str | None] = {}
         for each in entries:
+            classes[each.node, each.topic] = _class_name(each.publisher_class)
             known = sums.setdefault((each.node, each.topic), [0, 0, 0])
             known[0] += each.sent
             known[1] += each.missed
             known[2] += each.late
         self.publishers = {
-            key: PublisherCount(clamp(sent), clamp(missed), clamp(late), self._rate(key, time, sent, before))
+            key: PublisherCount(
+                clamp(sent), clamp(missed), clamp(late), self._rate(key, time, sent, before), classes[key]
+            )
             for key, (sent, missed, late) in sums.items()
         }
 
@@ -240,6 +245,11 @@ _SUBSCRIBER_LOSSES = {"queue full": "lost", "undecodable": "undecodable", "too l
 def clamp(count: int) -> int:
     """Return a sum over modules, within what JSON can have."""
     return min(count, COUNT_MAX)
+
+
+def _class_name(number: int) -> str | None:
+    known = (name for publisher_class, name in CLASS_NAMES.items() if publisher_class == number)
+    return next(known, None)  # a later r2p may have others
 
 
 def _reasons(counts: Iterable[ReasonCount]) -> dict[str, int]:

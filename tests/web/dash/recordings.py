@@ -56,7 +56,9 @@ def wheels(number: int) -> SampleEntry:
     message = Wheels(left=value, right=-value, names=(number,) * (number % 3))
     due = time + 5_000_000 if number % 100 else time - 1_000_000
     source = r2p.Source("ROBOT", "drive", "tcp")
-    sample = r2p.Sample(message.encode(), source, time, due, number + 1, PublisherClass.PERIODIC)
+    sample = r2p.Sample(
+        message.encode(), source, time, due, number + 1, PublisherClass.NON_REAL_TIME
+    )  # by a link that has no classes
     return SampleEntry("wheels", sample, Wheels, time)
 
 

@@ -306,6 +306,8 @@ class _Instant:
                 topic = network_name(module, name, self._static.channels)
                 row = self._static.publishers(topic).get((module, node)) or PublisherFigures(module, node)
                 row.rate, row.sent, row.missed, row.late = count.rate, count.sent, count.missed, count.late
+                # Messages that came by a link without classes, such as a gateway's TCP port, were recorded without.
+                row.publisher_class = count.publisher_class or row.publisher_class
                 found[topic][module, node] = row
         return found
 
