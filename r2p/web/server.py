@@ -30,6 +30,7 @@ from urllib.parse import parse_qs, quote, urlsplit
 import msgspec
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
+from websockets.frames import Frame, Opcode
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
@@ -55,6 +56,7 @@ _REQUEST_TIME = 10.0  # seconds for a request and its answer
 _ORIGINS_MAX = 16  # refused pages whose names are kept
 _BACKLOG = 16  # connections that are accepted in one turn of the event loop
 _WRITE_BUFFER = 1 << 18  # bytes of a connection beyond which its client's own queue fills
+_FRAGMENTS_MAX = 1024  # of a message; empty ones cost memory, and not every release of websockets limits them
 _PONGS_MAX = 1 << 16  # bytes of answers to pings beyond that, which would pass by the client's queue
 _PORT_ERRORS = (errno.EADDRINUSE, errno.EACCES)
 _CSP = (
@@ -108,6 +110,7 @@ class _WebConnection(ServerConnection):
         self._listener = listener
         self._received = 0
         self._pongs = 0
+        self._fragments = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -131,6 +134,18 @@ class _WebConnection(ServerConnection):
             self._limit_pongs(self.transport.get_write_buffer_size() - waiting)
         else:
             self._pongs = 0
+
+    def process_event(self, event: Any) -> None:
+        if isinstance(event, Frame):
+            if not event.fin:
+                self._fragments += 1
+                if self._fragments > _FRAGMENTS_MAX:
+                    self._listener.refused["message in too many fragments"] += self._fragments == _FRAGMENTS_MAX + 1
+                    self.transport.abort()
+                    return
+            elif event.opcode is Opcode.CONT:
+                self._fragments = 0
+        super().process_event(event)
 
     def _limit_pongs(self, size: int) -> None:
         """End the connection of a client that sends pings and does not read: their answers have no other limit."""

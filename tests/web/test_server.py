@@ -166,13 +166,31 @@ async def test_a_message_that_is_too_long_ends_its_client_alone() -> None:
         assert await other.recv() == "hello"
 
 
+async def open_raw(server: WebServer) -> asyncio.StreamWriter:
+    """Return what writes to a WebSocket, which nothing reads any more."""
+    reader, writer = await asyncio.open_connection(*server.address)
+    key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13"
+    head = f"GET /echo HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{key}\r\n\r\n"
+    writer.write(head.encode())
+    await reader.readuntil(b"\r\n\r\n")
+    return writer
+
+
+async def test_a_message_of_endless_empty_fragments_ends_its_client_alone() -> None:
+    async with serving() as server:
+        async with connect(websocket_url(server), proxy=None) as client:
+            await client.send(["frag", "ments"])
+            assert await client.recv() == "fragments"
+        writer = await open_raw(server)
+        writer.write(b"\x01\x80\0\0\0\0" + 2000 * b"\x00\x80\0\0\0\0")
+        await until(lambda: server.refused["message in too many fragments"] == 1)
+        writer.close()
+        assert await says_hello(server)
+
+
 async def test_pings_of_a_client_that_does_not_read_end_it_alone() -> None:
     async with serving() as server:
-        reader, writer = await asyncio.open_connection(*server.address)
-        key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13"
-        head = f"GET /echo HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{key}\r\n\r\n"
-        writer.write(head.encode())
-        await reader.readuntil(b"\r\n\r\n")
+        writer = await open_raw(server)
         ping = b"\x89\xfd" + bytes(4 + 125)
         with contextlib.suppress(ConnectionError):
             while not server.refused:
