@@ -15,6 +15,7 @@
     ├── NoServer                     a service that no module on the network serves
     ├── ParameterError(ValueError)   a value that a parameter can't have, or a parameter that does not exist
     ├── BagError                     a recording that can't be read or written
+    ├── WebError                     a page that can't be served
     ├── NodeCrashed(ExceptionGroup)  the exceptions of a module's nodes
     └── Deadlock                     virtual time with nothing left to wait for
 

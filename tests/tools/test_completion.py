@@ -44,7 +44,7 @@ def completions(line: str) -> list[str]:
 @pytest.mark.parametrize(
     ("line", "found"),
     [
-        ("r2p to", ["topic"]),
+        ("r2p to", ["topic", "top"]),
         ("r2p topic d", ["delay"]),
         ("r2p topic echo --fie", ["--field"]),
         ("r2p topic echo leds --format j", ["json"]),
