@@ -142,7 +142,12 @@ async def test_the_graph_has_all_nodes_and_says_so_in_words(browser: Browser, da
         await show(tab, "graph", "document.querySelectorAll('#view svg text').length > 20")
         topics = [topic for topic in dash.monitor.snapshot.topics if topic.name not in (BUS_LOAD, BUS_SLOTS)]
         nodes = {f"{each.module}/{each.node}" for topic in topics for each in topic.publishers}
-        words = [*(each for each in nodes if not each.endswith("/log")), "odometry", "speed", "encoder1", "velocity_cmd"]
+        words = [each for each in nodes if not each.endswith("/log")] + [
+            "odometry",
+            "speed",
+            "encoder1",
+            "velocity_cmd",
+        ]
         texts = "[...document.querySelectorAll('#view svg text')].map(each => each.textContent)"
         await tab.until(f"argument.every(each => {texts}.includes(each))", words)
 

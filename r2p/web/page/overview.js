@@ -182,7 +182,7 @@ class OverviewView {
       memory.set("internal", box.checked)
       this.#update({ always: true })
     } })
-    return h("label", { class: "field", title: "Topics that carry the calls of services", hidden: true }, box, "Topics of services")
+    return h("label", { class: "check", title: "Topics that carry the calls of services", hidden: true }, box, "Topics of services")
   }
 
   // The sums above the tables; a click on one goes to its table.

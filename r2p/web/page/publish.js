@@ -7,6 +7,7 @@ import { MessageForm } from "./message_form.js"
 
 const RATE_MAX = 200 // messages per second; r2p/web/dash/publications.py refuses more
 const RATE = 10
+const ATTEMPTS = 3 // to find a type
 
 export const publish = {
   id: "publish",
@@ -45,7 +46,12 @@ class PublishView {
     this.#once, this.#repeat, field("at", this.#rate), "Hz", this.#reset)
   #list = h("ul", { class: "running", "aria-label": "Published at a rate" })
   #chip = h("a", { class: "chip warn", href: "#/publish", hidden: true })
-  #update = () => this.#describeTopic()
+  #attempts = 0
+  #isUntyped = false
+  #update = () => {
+    this.#describeTopic()
+    if (this.#isUntyped) this.#makeForm()
+  }
 
   constructor(app) {
     this.#app = app
@@ -109,16 +115,29 @@ class PublishView {
     this.#app.rename("publish", this.#topic)
     setText(this.#error, "")
     this.#show(null)
+    this.#attempts = 0
+    this.#isUntyped = false
     if (!this.#topic) return
     setText(this.#about, "Asking for the type")
-    try {
-      const wanted = this.#topic
-      const form = await this.#formOf(wanted, type.trim())
-      if (wanted === this.#topic) this.#show(form)
-    } catch (error) {
-      setText(this.#error, error.message)
-    }
+    await this.#makeForm()
     this.#describeTopic()
+  }
+
+  // A type that could not be found, as the modules that have it were silent, is asked for again with the next figures.
+  async #makeForm() {
+    const [topic, type] = [this.#topic, this.#typeName]
+    const isCurrent = () => topic === this.#topic && type === this.#typeName
+    this.#isUntyped = false
+    try {
+      const form = await this.#formOf(topic, type)
+      if (!isCurrent()) return
+      setText(this.#error, "")
+      this.#show(form)
+    } catch (error) {
+      if (!isCurrent()) return
+      setText(this.#error, error.message)
+      this.#isUntyped = this.#app.store.topics.has(topic) && ++this.#attempts < ATTEMPTS
+    }
   }
 
   async #formOf(topic, type) {

@@ -8,6 +8,7 @@ import { LiveTable } from "./table.js"
 const TIMEOUT = 5 // s
 const TIMEOUT_MAX = 300 // s; r2p/web/dash/publications.py refuses more
 const CALLS = 20 // calls that are listed
+const ATTEMPTS = 3 // to find the types of a service
 
 export const services = {
   id: "services",
@@ -51,7 +52,12 @@ class ServicesView {
   #calls = h("ol", { class: "calls stack", "aria-label": "Calls, the newest first" })
   #said = h("p", { class: "sr-only", role: "status" })
   #panel
-  #update = () => this.#table.update(this.#app.store.services.values())
+  #attempts = 0
+  #isUndescribed = false
+  #update = () => {
+    this.#table.update(this.#app.store.services.values())
+    if (this.#isUndescribed) this.#describe()
+  }
 
   constructor(app) {
     this.#app = app
@@ -102,12 +108,24 @@ class ServicesView {
     this.#calls.replaceChildren()
     setText(this.#title, service)
     setText(this.#error, "")
-    if (!service) return
+    this.#attempts = 0
+    this.#isUndescribed = false
+    if (service) await this.#describe()
+  }
+
+  // A service that could not be described, as its server was silent, is asked for again with the next figures.
+  async #describe() {
+    const service = this.#service
+    this.#isUndescribed = false
     try {
       const { request } = await this.#app.connection.request("describe", { service })
-      if (service === this.#service) this.#show(request)
+      if (service !== this.#service) return
+      setText(this.#error, "")
+      this.#show(request)
     } catch (error) {
+      if (service !== this.#service) return
       setText(this.#error, error.message)
+      this.#isUndescribed = ++this.#attempts < ATTEMPTS
     }
   }
 
