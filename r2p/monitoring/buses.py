@@ -281,7 +281,7 @@ class _BusLoads:
             self.filling.append(row)
 
     def rows(self, now: int) -> list[BusTraffic]:
-        """Return the rows of the last second that is complete; none if nothing comes any more."""
+        """Return the rows of the last complete second; an empty list once the reports have stopped."""
         if now - self.came_at > _SILENT:
             return []
         if self.filling and now - self.came_at >= _BURST:

@@ -1,4 +1,4 @@
-"""Whether a module has obeyed STOP, REBOOT or BOOTLOAD: what `r2p module` and the page of `r2p dash` wait for.
+"""Commands to modules and nodes, confirmed: for `r2p module` and the page of `r2p dash`.
 
 A command may get lost, so it is repeated until what the module announces confirms it.
 """
@@ -6,6 +6,7 @@ A command may get lost, so it is repeated until what the module announces confir
 import asyncio
 import contextlib
 from itertools import pairwise
+from typing import Literal
 
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import Error
@@ -117,3 +118,30 @@ async def _repeat(module: Module, command: Command, name: str, progress: Command
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_LOOK):
                     progress.note(await anext(events))
+
+
+async def order_node(module: Module, name: str, node: str, order: Literal["start", "stop", "restart"]) -> None:
+    """Start, stop or restart a node of a module.
+
+    Raises Error if the module refuses, or the node runs that is to start; and TimeoutError without an answer.
+    """
+    nodes = module.network.nodes_of(name)
+    if order == "stop":
+        await nodes.stop(node)
+        return
+    if order == "start":
+        listed = await nodes.fetch()
+        if any(each.node == node and each.running for each in listed.nodes):
+            raise Error(f"node {node} of {name} runs already")
+    await nodes.restart(node)
+
+
+async def order_module(module: Module, name: str, order: Literal["stop", "start", "reboot"]) -> None:
+    """Stop a module's nodes, start those of a stopped module, or restart it.
+
+    Raises Error if there is no such module or it does not obey, and TimeoutError if it does not confirm.
+    """
+    view = find_module(module, name)
+    if order == "start" and view is not None and view.state == "running":
+        raise Error(f"module {name} runs already")
+    await send_command(module, Command.STOP if order == "stop" else Command.REBOOT, name)

@@ -39,7 +39,7 @@ EndpointName = tuple[str, str]
 
 
 class PublisherCount(msgspec.Struct, frozen=True):
-    """What a node has published on a topic; `rate` is None until there are two answers."""
+    """What a node has published on a topic. `rate` is known from the second answer on, before that None."""
 
     sent: int
     missed: int
@@ -56,7 +56,7 @@ class SubscriberCount(msgspec.Struct, frozen=True):
 
 
 class ModuleCounters:
-    """The counters of one module. `answers` is None until it has answered, or has not in time."""
+    """The counters of one module. `answers` is None while the first question is open."""
 
     def __init__(self) -> None:
         self.answers: bool | None = None

@@ -126,7 +126,7 @@ class NetworkMonitor:
         measured.users += 1
 
     def stop_measuring(self, topic: str) -> None:
-        """End the subscription to a measured topic, if nothing else has asked for it."""
+        """Give up a measurement; the last user of a topic ends its subscription."""
         measured = self._sources.measured.get(topic)
         if measured is None:
             return

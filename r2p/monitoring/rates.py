@@ -12,7 +12,7 @@ _SPAN = 10.0  # s after which the beginning of the average moves on
 
 
 class CounterRate:
-    """The rate of one counter. `rate` is None until there are two readings."""
+    """The rate of one counter. `rate` is known from the second reading on, before that None."""
 
     __slots__ = ("_count", "_grown_at", "_middle", "_start", "_time", "rate")
 

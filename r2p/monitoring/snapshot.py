@@ -1,4 +1,4 @@
-"""The figures of a network at one time. What is not known is None, never 0.
+"""The figures of a network at one time. Unknown figures are None.
 
 Times are in seconds, sizes in bytes, rates per second. Counters count from the start of what they belong to.
 """
@@ -86,7 +86,7 @@ class TopicFigures(Figures):
 
 
 class NodeFigures(Figures):
-    """A node of a module; what its module does not report is None."""
+    """A node of a module. Figures that its module leaves out of its report are None."""
 
     name: str
     running: bool | None = None

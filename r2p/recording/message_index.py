@@ -26,7 +26,7 @@ _TIMES: Final = struct.Struct("<Q8x")
 
 
 def read_index(file: BagFile, chunk: ChunkRef) -> ChunkIndex | None:
-    """Return the indexes of a chunk; None if it has none, or they can't be right. Raises BagError if it can't be read.
+    """Return the indexes of a chunk; None for a chunk without them, or with wrong ones. Raises BagError.
 
     Offsets in it are not checked.
     """

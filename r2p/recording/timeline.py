@@ -331,7 +331,7 @@ def _parameters(bag: Bag, start: int, end: int | None) -> Iterator[TimelineEvent
 
 
 def parameter_change(values: ParameterValues, time: int, new: ParameterValue) -> TimelineEvent | None:
-    """Return the change of a parameter, and enter its value; the first one is no change."""
+    """Enter the value of a parameter and return its change; None for the first value."""
     key = new.module, new.node, new.name
     before, values[key] = values.get(key), new
     if before is None or (before.value, before.gone) == (new.value, new.gone):

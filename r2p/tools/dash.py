@@ -14,9 +14,8 @@ from r2p.monitoring.topic_types import TypeFinder
 from r2p.tools.output import notify
 from r2p.tools.session import Session, UsageError, joined
 from r2p.tools.types import Types
-from r2p.web.dash.assets import page
 from r2p.web.dash.live import LiveSource
-from r2p.web.dash.session import PATH, endpoint
+from r2p.web.dash.session import PATH, endpoint, page
 from r2p.web.dash.source import DashSource
 from r2p.web.server import LOOPBACK, WebOptions, WebServer
 

@@ -118,7 +118,7 @@ def _check_rosbags() -> None:
 
 
 async def _report_pages(web: WebServer) -> None:
-    """Report pages that were refused, as they show nothing of it themselves."""
+    """Report refused pages: these show no reason themselves."""
     reported: set[str] = set()
     while True:
         await asyncio.sleep(_LOOK)

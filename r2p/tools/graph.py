@@ -136,6 +136,6 @@ def dot(topics: Sequence[GraphTopic]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a text in quotes, in which nothing has a meaning but the end of a line."""
+    """Return a quoted text of DOT: all characters but ends of lines stand for themselves."""
     safe = printable(text, "\n").replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
     return f'"{safe}"'

@@ -209,7 +209,7 @@ def _places(layers: _Layers) -> tuple[dict[_Vertex, _Place], float, float]:
 
 
 def _width(vertex: _Vertex) -> float:
-    """Return the width of a box; nothing for the place of an edge."""
+    """Return the width of a box; 0 for the place of an edge."""
     if vertex.kind == "via":
         return 0
     longest = max(map(len, _labels(vertex)))

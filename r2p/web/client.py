@@ -135,7 +135,7 @@ class WebClient:
         return self._queue.popleft() if self._queue else None
 
     def _forget(self, entry: _WaitingMessage) -> None:
-        """Count a message no longer as waiting."""
+        """Subtract a message from those that wait."""
         if entry.stream is None:
             self._answers -= entry.size
             return

@@ -272,7 +272,7 @@ class WebServer:
         return self._file(urlsplit(request.path).path)
 
     def _refusal(self, request: Request) -> Response | None:
-        """Return why a WebSocket may not open; None if it may."""
+        """Return the reason to refuse a WebSocket; None for one that may open."""
         if not self._is_own_host(request.headers):
             return self._refuse(http.HTTPStatus.FORBIDDEN, "unknown host")
         if urlsplit(request.path).path not in self._endpoints:
@@ -349,7 +349,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _own_address(wildcard: str) -> str:
-    """Return the address of this computer in its network, for a link that others open; nothing is sent."""
+    """Return the address of this computer in its network, for links that others open, without sending anything."""
     family, outside = (socket.AF_INET6, "2001:db8::1") if ":" in wildcard else (socket.AF_INET, "192.0.2.1")
     with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.connect((outside, 9))

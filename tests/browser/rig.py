@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from r2p.tools.dash import live_source
 from r2p.tools.session import Settings, join
-from r2p.web.dash.assets import page
-from r2p.web.dash.session import PATH, endpoint
+from r2p.web.dash.session import PATH, endpoint, page
 from r2p.web.server import WebOptions, WebServer
 
 if TYPE_CHECKING:

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import pytest
 
-from r2p.web.dash.assets import page
 from r2p.web.dash.recorded.source import RecordedSource
-from r2p.web.dash.session import PATH, endpoint
+from r2p.web.dash.session import PATH, endpoint, page
 from r2p.web.server import WebOptions, WebServer
 from tests.browser import looks
 from tests.browser.rig import Dash, Tab, opened

@@ -11,7 +11,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
 from r2p.errors import WebError
-from r2p.web.dash.assets import page
+from r2p.web.dash.session import page
 from r2p.web.server import CLIENTS_MAX, CONNECTIONS_MAX, WebEndpoint, WebOptions, WebServer
 from tests.transports.rtcan.networks import until
 

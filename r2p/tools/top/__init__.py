@@ -84,7 +84,7 @@ def _check_sort(view: View, column: str) -> None:
 
 
 def _wants_screen(*, count: int | None, format: str | None) -> bool:
-    """Return whether there is a terminal to draw on, and nothing was asked for that only tables have."""
+    """Return whether to draw on a terminal: there is one, and no option asks for tables."""
     if count is not None or format is not None or not (sys.stdin.isatty() and sys.stdout.isatty()):
         return False
     if importlib.util.find_spec("textual") is None:

@@ -72,7 +72,7 @@ class KeyLine(TextLines):
 
 
 def _text(given: str | Text) -> Text:
-    """Return a text in which nothing moves the cursor."""
+    """Return a text without characters that move the cursor."""
     return given if isinstance(given, Text) else Text(printable(given))
 
 

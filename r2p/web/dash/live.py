@@ -10,6 +10,7 @@ from r2p.errors import InvalidName, WebError
 from r2p.messages import Message, layout
 from r2p.messages.values import to_plain
 from r2p.modules.module import Module
+from r2p.monitoring import commands
 from r2p.monitoring.fields import describe_fields
 from r2p.monitoring.log import LogFollower
 from r2p.monitoring.monitor import NetworkMonitor
@@ -18,7 +19,7 @@ from r2p.monitoring.topic_types import TypeFinder
 from r2p.ros.classes import standard_classes
 from r2p.version import __version__
 from r2p.web.client import WebClient
-from r2p.web.dash import orders, protocol
+from r2p.web.dash import protocol
 from r2p.web.dash.feeds import PlotStream, TopicFeeds
 from r2p.web.dash.log_feed import LogFeed, PageLog
 from r2p.web.dash.publications import Publications, call_service, service_types
@@ -218,10 +219,10 @@ class LiveSession(SourceSession):
         return await self._source.module.network.save_parameters(request.module)
 
     async def _order_node(self, request: protocol.OrderNode) -> None:
-        await orders.order_node(self._source.module, request.module, request.node, request.order)
+        await commands.order_node(self._source.module, request.module, request.node, request.order)
 
     async def _order_module(self, request: protocol.OrderModule) -> None:
-        await orders.order_module(self._source.module, request.module, request.order)
+        await commands.order_module(self._source.module, request.module, request.order)
 
 
 def describe(cls: type[Message]) -> dict[str, Any]:

@@ -46,11 +46,11 @@ STREAM_MAX = (1 << 16) - 1
 _HEAD = struct.Struct("<BBHI")
 
 
-class _Request(msgspec.Struct, tag_field="op", forbid_unknown_fields=True, kw_only=True):
+class _PageRequest(msgspec.Struct, tag_field="op", forbid_unknown_fields=True, kw_only=True):
     id: int
 
 
-class Plot(_Request, tag="plot"):
+class Plot(_PageRequest, tag="plot"):
     """Send points of fields ("odometry.pose.x", "scan.ranges[3]"), all of one topic, as `stream`.
 
     A recording answers with at most `points` for each column between `start` and `end` (s, UTC); the smallest and the
@@ -64,31 +64,31 @@ class Plot(_Request, tag="plot"):
     points: int = 2000
 
 
-class StopPlot(_Request, tag="stop_plot"):
+class StopPlot(_PageRequest, tag="stop_plot"):
     """Stop sending points of a stream."""
 
     stream: int
 
 
-class Watch(_Request, tag="watch"):
+class Watch(_PageRequest, tag="watch"):
     """Send the newest messages of a topic, decoded; meanwhile its figures have its latency and its losses, too."""
 
     topic: str
 
 
-class Unwatch(_Request, tag="unwatch"):
+class Unwatch(_PageRequest, tag="unwatch"):
     """Stop sending messages of a topic."""
 
     topic: str
 
 
-class FollowLog(_Request, tag="log"):
+class FollowLog(_PageRequest, tag="log"):
     """Send log records, from now on and the last ones before; `level` DEBUG, INFO, WARNING, ERROR, FATAL and above."""
 
     level: str = "INFO"
 
 
-class Describe(_Request, tag="describe"):
+class Describe(_PageRequest, tag="describe"):
     """Answer with a type: {"type": ..., "fields": [{"path", "kind", ...}, ...], "zero": {...}}.
 
     Of a topic, or of the standard `type` that it is to have; or of a service's request and response: {"request": {...},
@@ -106,7 +106,7 @@ class Describe(_Request, tag="describe"):
     type: str = ""
 
 
-class Publish(_Request, tag="publish"):
+class Publish(_PageRequest, tag="publish"):
     """Publish a message, once, or `rate` times a second until another one comes, it is stopped, or the page leaves.
 
     The answer is {"subscribers": n}, to whom the first one went. `type` is for a topic new to the network: the full
@@ -119,13 +119,13 @@ class Publish(_Request, tag="publish"):
     rate: float = 0.0
 
 
-class StopPublishing(_Request, tag="stop_publishing"):
+class StopPublishing(_PageRequest, tag="stop_publishing"):
     """Publish a topic no more at a rate."""
 
     topic: str
 
 
-class CallService(_Request, tag="call"):
+class CallService(_PageRequest, tag="call"):
     """Call a service, and answer with its response."""
 
     service: str
@@ -133,13 +133,13 @@ class CallService(_Request, tag="call"):
     timeout: float = 5.0
 
 
-class ListParameters(_Request, tag="parameters"):
+class ListParameters(_PageRequest, tag="parameters"):
     """Answer with the parameters of a module, as a list of `ParameterInfo`."""
 
     module: str
 
 
-class SetParameters(_Request, tag="set_parameters"):
+class SetParameters(_PageRequest, tag="set_parameters"):
     """Set parameters of a node, all or nothing; None is the value of the start."""
 
     module: str
@@ -147,13 +147,13 @@ class SetParameters(_Request, tag="set_parameters"):
     values: dict[str, Any]
 
 
-class SaveParameters(_Request, tag="save_parameters"):
+class SaveParameters(_PageRequest, tag="save_parameters"):
     """Have a module save what was set."""
 
     module: str
 
 
-class OrderNode(_Request, tag="node"):
+class OrderNode(_PageRequest, tag="node"):
     """Start, stop or restart a node."""
 
     module: str
@@ -161,26 +161,26 @@ class OrderNode(_Request, tag="node"):
     order: Literal["start", "stop", "restart"]
 
 
-class OrderModule(_Request, tag="module"):
+class OrderModule(_PageRequest, tag="module"):
     """Stop, start or reboot a module."""
 
     module: str
     order: Literal["stop", "start", "reboot"]
 
 
-class Seek(_Request, tag="seek"):
+class Seek(_PageRequest, tag="seek"):
     """Show a recording as it was at a time (ns, UTC)."""
 
     time: int
 
 
-class Play(_Request, tag="play"):
+class Play(_PageRequest, tag="play"):
     """Let the time of a recording run, at a rate; 0 stops it."""
 
     rate: float = 1.0
 
 
-class ReadTimeline(_Request, tag="timeline"):
+class ReadTimeline(_PageRequest, tag="timeline"):
     """Answer with what is in a recording, and send what happened as news, while it is found.
 
     {"start": ns, "end": ns, "step": ns of a step of misses, "files": [...], "problems": [...]}

@@ -1,4 +1,4 @@
-"""Serves one page: answers its requests, and sends it the figures that have changed.
+"""Serves one page: its files, the answers to its requests, and the figures that have changed.
 
 A page that does not read gets fewer states, never wrong ones: the next state is made when the last one is on its way,
 of all that has changed since. One that asks for too much waits, or is refused; nothing that it does keeps other pages
@@ -8,6 +8,8 @@ waiting.
 import asyncio
 import contextlib
 from collections.abc import Iterable, Iterator
+from importlib.resources import files
+from importlib.resources.abc import Traversable
 from itertools import islice
 from typing import Any
 
@@ -19,7 +21,7 @@ from r2p.monitoring.snapshot import Figures, NetworkSnapshot
 from r2p.web.client import WebClient
 from r2p.web.dash import protocol
 from r2p.web.dash.source import DashSource, SourceSession
-from r2p.web.server import WebEndpoint
+from r2p.web.server import WebEndpoint, WebFile
 
 PATH = "/dash"
 
@@ -36,6 +38,13 @@ _BURST = 1.0  # seconds of requests at these rates that do not wait, as when a p
 _ROWS = 500  # of one message with figures
 _DROPPED_PERIOD = 1.0  # seconds between two reports of what a page was too slow for
 _ERROR_MAX = 1000  # characters of an error
+
+_MEDIA_TYPES = {
+    ".css": "text/css; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
 
 logger = get_logger("r2p.web")
 
@@ -199,3 +208,20 @@ def _changed(before: _Table, now: _Table) -> Iterator[tuple[str, Figures]]:
 def keyed(rows: Iterable[Any]) -> _Table:
     """Return the rows of a table by their key; of links the module is a part of it."""
     return {f"{row.module} {row.name}" if hasattr(row, "module") else row.name: row for row in rows}
+
+
+def page() -> dict[str, WebFile]:
+    """Read the files of the page from the package; return them by path."""
+    return dict(_files_in(files("r2p.web").joinpath("page"), ""))
+
+
+def _files_in(folder: Traversable, path: str) -> list[tuple[str, WebFile]]:
+    found: list[tuple[str, WebFile]] = []
+    for each in folder.iterdir():
+        name = f"{path}/{each.name}"
+        suffix = name[name.rfind(".") :]
+        if each.is_dir():
+            found += _files_in(each, name)
+        elif suffix in _MEDIA_TYPES:
+            found.append((name, WebFile(_MEDIA_TYPES[suffix], each.read_bytes())))
+    return found

@@ -131,7 +131,7 @@ class ChannelTable:
     def __init__(self, space: TopicSpace, node: Node, types: TypeFinder, added: Changed, removed: Changed) -> None:
         self.by_number: dict[int, Channel] = {}
         self.counts: Counter[str] = Counter()
-        """What is not as it should be with stamps of messages."""
+        """The problem with the stamps of messages."""
         self._space = space
         self._node = node
         self._types = types

@@ -19,7 +19,7 @@ class ConnectionGraph(msgspec.Struct, frozen=True):
     served: _Ids = {}
 
     def update(self, before: "ConnectionGraph") -> GraphUpdate | None:
-        """Return what has changed; None if nothing has."""
+        """Return the changes; None without any."""
         topics, services = self.published | self.subscribed, self.served
         gone = sorted((before.published | before.subscribed).keys() - topics.keys())
         found = GraphUpdate(

@@ -29,7 +29,7 @@ _AT_ONCE = 16  # modules that are asked
 _Names = Collection[str]
 ParametersChanged = Callable[[list[ParameterInfo]], None]
 Report = Callable[[str, str], None]
-"""Called with a module, and with what is wrong with its parameters; empty: nothing any more."""
+"""Called with a module and the problem with its parameters; an empty text ends the problem."""
 
 
 def to_parameter(info: ParameterInfo) -> FoxgloveParameter:

@@ -100,7 +100,7 @@ class SubscribeChannels(_FoxgloveOperation, tag="subscribe", frozen=True):
 
 
 class UnsubscribeChannels(_FoxgloveOperation, tag="unsubscribe", frozen=True):
-    """Send them no more."""
+    """Stop sending the messages of these subscriptions."""
 
     subscription_ids: list[Number]
 
@@ -138,7 +138,7 @@ class SubscribeParameters(_FoxgloveOperation, tag="subscribeParameterUpdates", f
 
 
 class UnsubscribeParameters(_FoxgloveOperation, tag="unsubscribeParameterUpdates", frozen=True):
-    """Send them no more; none at all, if none is named."""
+    """Stop sending updates of these parameters; an empty list names all."""
 
     parameter_names: list[str]
 

@@ -156,7 +156,7 @@ class _Contents:
 
 
 def _is_short(channel: BagChannel) -> bool:
-    """Return whether the names of a channel are no longer than those of a network can be, by far."""
+    """Return whether the names of a channel have lengths that a network could have."""
     info = channel.info
     names = (channel.name, channel.type_name, *((info.module, info.node, info.link) if info is not None else ()))
     return max(map(len, names)) <= _NAME_MAX
@@ -171,7 +171,7 @@ def _is_observed(channel: BagChannel) -> bool:
 
 
 def _described_nodes(bag: Bag) -> dict[Node, _DescribedNode]:
-    """Return the nodes of the description of the network that the recorder has attached; none if there is none."""
+    """Return the nodes in the description of the network that the recorder attached; without one, an empty list."""
     for attachment in itertools.chain.from_iterable(file.attachments(NETWORK, _ATTACHMENT_MAX) for file in bag.files):
         try:
             network = msgspec.json.decode(attachment.data, type=_DescribedNetwork)
@@ -427,6 +427,6 @@ class _Instant:
 
 
 def _sum(values: Iterable[int | None]) -> int | None:
-    """Return the sum of the counts that are known; None if there are none."""
+    """Return the sum of the known counts; None without any."""
     known = [each for each in values if each is not None]
     return clamp(sum(known)) if known else None

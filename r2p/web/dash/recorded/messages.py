@@ -42,7 +42,7 @@ class WatchedTopic:
         )
 
     async def news(self, time: int) -> dict[str, Any] | None:
-        """Return the last message up to `time` (ns) as pages get it; None if it was returned last time, too."""
+        """Return the last message up to `time` (ns) as pages get it; None for the message of the last call."""
         bag = await self._reader.bag()
         last: tuple[int, MessageRecord] | None = None
         for number, chunk in itertools.islice(self._table.back_from(time), _CHUNKS_MAX):

@@ -64,7 +64,7 @@ class RecordingReader:
 
     @contextmanager
     def ahead(self) -> Iterator[None]:
-        """Let nothing that is behind begin within the block, also between two steps."""
+        """Hold back work of lower priority during the block, also between two steps."""
         self._waiting += 1
         self._idle.clear()
         try:
@@ -75,7 +75,7 @@ class RecordingReader:
                 self._idle.set()
 
     async def run_behind(self, step: Callable[[], T]) -> T:
-        """Run a function in the thread when nothing waits for it that a user looks at, by turns with others."""
+        """Run a function in the thread at low priority, in turn with other background work."""
         await self._idle.wait()
         return await asyncio.get_running_loop().run_in_executor(self._thread, step)
 

@@ -303,7 +303,7 @@ class RecordedSession(SourceSession):
 
 
 async def _reported(work: Coroutine[Any, Any, None]) -> None:
-    """Do some work for a page; an error in it ends nothing else."""
+    """Do some work for a page. An error ends only this work."""
     try:
         await work
     except Exception as error:
