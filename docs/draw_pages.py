@@ -52,7 +52,7 @@ VIEWS = {
 def _robot() -> Iterator[str]:
     """The emulated robot, as the tutorial starts it."""
     program = str(Path(sys.executable).with_name("r2p"))
-    command = [program, "sim", "triskar2", "--square", "--allow-control", "--via", f"tcp-listen:{PORT}"]
+    command = [program, "sim", "triskar2", "--drive", "--allow-control", "--via", f"tcp-listen:{PORT}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
         try:
             assert child.stdout is not None

@@ -31,10 +31,13 @@ from rich.text import Text
 from r2p import sim
 from r2p.monitoring.monitor import NetworkMonitor
 from r2p.sim.robots.figures import RobotFigures
-from r2p.tools import doctor, simulator
+from r2p.tools import doctor
 from r2p.tools.main import app
 from r2p.tools.session import Settings, join
-from r2p.tools.simulator import SimulatorScreen, simulate
+from r2p.tools.sim import run
+from r2p.tools.sim.run import simulate
+from r2p.tools.sim.screen import SimulatorScreen
+from r2p.tools.sim.triskar2 import Triskar2Display
 from r2p.tools.top.app import TopApp
 from r2p.tools.top.topic_screen import TopicScreen
 from r2p.tools.topic.rates import hz
@@ -177,7 +180,7 @@ def _terminal(columns: int = COLUMNS) -> Iterator[_Terminal]:
 
 
 def _beside_the_robot() -> dict[str, Screen]:
-    with _terminal(), patch.object(simulator, "addresses", lambda _robot: [_ADDRESS]):
+    with _terminal(), patch.object(run, "addresses", lambda _robot: [_ADDRESS]):
         return sim.run(_robot, seed=1)
 
 
@@ -194,7 +197,7 @@ async def _robot() -> dict[str, Screen]:
             screens["demo-narrow"] = _frame(screen, figures, NARROW, 24)
 
     with patch.object(SimulatorScreen, "show", show):
-        robot = asyncio.create_task(simulate(duration=20.0, outside=[_OUTSIDE], laps=1))
+        robot = asyncio.create_task(simulate(Triskar2Display, duration=20.0, outside=[_OUTSIDE], rounds=1))
         await asyncio.sleep(8.0)
         with _terminal() as terminal:
             async with join(Settings(via=[_OUTSIDE]), name="hz") as session:

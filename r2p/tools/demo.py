@@ -1,7 +1,7 @@
 """`r2p demo`: r2p at work on one computer, with emulated hardware and real links.
 
 `r2p demo` shows a whole robot, Triskar2: seven modules on a simulated RTCAN bus, and a PC that drives it along a square
-through the robot's gateway (`r2p.tools.simulator`). `r2p demo line` starts two modules with the firmware of 2014, IMU1
+through the robot's gateway (`r2p.tools.sim`). `r2p demo line` starts two modules with the firmware of 2014, IMU1
 on a TCP connection and MOTOR1 on a pseudo terminal, as on a serial cable, and a module PC1 that talks to both over the
 debug line (`Robot`); `DemoScreen` shows what they do, live at a terminal, otherwise as lines of plain text.
 """
@@ -26,8 +26,10 @@ from r2p.messages import Message
 from r2p.msg import Encoder, Led, StampedIMURaw9, StampedVelocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
 from r2p.tools.options import Quiet, Verbose, time_option
+from r2p.tools.output import program
 from r2p.tools.session import execute, moments, wait_until
-from r2p.tools.simulator import default_links, program, simulate
+from r2p.tools.sim.run import default_links, simulate
+from r2p.tools.sim.triskar2 import Triskar2Display
 from r2p.units import SECOND
 
 _ROBOT, _LINE = 20.0, 10.0  # seconds
@@ -76,7 +78,7 @@ def command(
         screen.print_summary(robot)
 
     async def robot() -> None:
-        await simulate(duration=duration or _ROBOT, outside=default_links(), laps=1)
+        await simulate(Triskar2Display, duration=duration or _ROBOT, outside=default_links(), rounds=1)
         typer.echo(_next_steps())
 
     # Only errors are logged: any other line would tear the display apart.

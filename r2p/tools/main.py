@@ -37,7 +37,7 @@ COMMANDS = {
     "run": ("r2p.tools.run", "Run functions as the nodes of a module."),
     "launch": ("r2p.tools.launch", "Start the commands of a file as one group, such as a robot."),
     "gateway": ("r2p.tools.gateway", "Join links to one network: a robot's bus, a debug line, zenoh."),
-    "sim": ("r2p.tools.simulator", "Run an emulated robot, without hardware."),
+    "sim": ("r2p.tools.sim.command", "Run an emulated robot, without hardware."),
     "top": ("r2p.tools.top", "Show topics, modules and buses with their figures, as they change."),
     "dash": ("r2p.tools.dash", "Show the network, or a recording, in a browser."),
     "graph": ("r2p.tools.graph", "Show or draw which nodes publish which topics to which nodes."),

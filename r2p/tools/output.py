@@ -23,6 +23,7 @@ import stat
 import sys
 import textwrap
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TextIO
 
@@ -356,3 +357,14 @@ def log_to_stderr(level: int) -> Iterator[None]:
         logger.removeHandler(_HANDLER)
         logger.propagate = propagate
         logger.setLevel(before)
+
+
+def program() -> str:
+    """Return what to type for this program in another terminal in the same folder."""
+    typed = sys.argv[0]
+    if Path(typed).name == "__main__.py":
+        return f"{sys.orig_argv[0]} -m r2p"
+    if Path(typed).name != "r2p" or not os.access(typed, os.X_OK):  # not started as a command
+        return "r2p"
+    found = shutil.which("r2p")
+    return "r2p" if found and Path(found).samefile(typed) else typed

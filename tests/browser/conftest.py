@@ -55,7 +55,7 @@ def browser(loop_thread: rig.LoopThread) -> Generator[Browser, None, None]:
 @pytest.fixture(scope="session")
 def robot(browser: Browser) -> Generator[str, None, None]:
     """The URL of the emulated robot, which drives along squares."""
-    with process("sim", "--square", "--allow-control", "--via", "tcp-listen:0", patience=RUN) as child:
+    with process("sim", "--drive", "--allow-control", "--via", "tcp-listen:0", patience=RUN) as child:
         assert child.stdout is not None
         yield next(found[1] for line in child.stdout if (found := re.search(r"--via (tcp:\S+)", line)))
 

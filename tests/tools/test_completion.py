@@ -52,7 +52,7 @@ def completions(line: str) -> list[str]:
         ("r2p topic pub cmd --type r2p.msg:Velo", ["r2p.msg:Velocity3"]),
         ("r2p demo l", ["line"]),
         ("r2p msg import sensor_msgs/Ran", ["sensor_msgs/Range"]),
-        ("r2p sim --sq", ["--square"]),
+        ("r2p sim --dr", ["--drive"]),
         ("r2p topic echo robot/e", ["robot/encoder"]),
         ("r2p topic echo --via memory:lab l", []),
         ("r2p launch --ready dr", ["drive"]),

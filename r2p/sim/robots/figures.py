@@ -1,9 +1,13 @@
-"""The state of an emulated robot in figures, read from its counters, so that the display does not disturb it."""
+"""The state of an emulated robot in figures, read from its counters, so that the display does not disturb it.
+
+`FiguresReader` reads what all robots have, topics and the bus. What a robot has of its own is the `body` of the
+figures; the parts that several have are here, too.
+"""
 
 import math
 from collections import deque
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Generic, NamedTuple, TypeVar
 
 import msgspec
 
@@ -13,8 +17,9 @@ from r2p.codecs import rtcan
 from r2p.msg import Odometry, Pose3
 from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher
 from r2p.sim import SimCan
+from r2p.sim.physics.motor import Drive
 from r2p.sim.physics.world import Triple
-from r2p.sim.robots.emulated import MOTORS, Triskar2
+from r2p.sim.robots.base import EmulatedRobot
 from r2p.transports.rtcan.link import RtcanLink
 from r2p.units import SECOND
 
@@ -29,6 +34,8 @@ _CLASSES = {
     r2p.PublisherClass.PERIODIC: _PERIODIC,
 }
 _URGENCY = [_HARD, _PERIODIC, _SOFT, _NOT]
+
+B = TypeVar("B")
 
 
 class RobotTopicFigures(msgspec.Struct, frozen=True):
@@ -60,6 +67,37 @@ class OdometryFigures(msgspec.Struct, frozen=True):
         return math.hypot(self.pose.x - self.truth[0], self.pose.y - self.truth[1])
 
 
+class OdometryCheck:
+    """Compares odometry with the true pose."""
+
+    def __init__(self, pose: Callable[[], Triple]) -> None:
+        """`pose` returns the true one."""
+        self.off_max = 0.0
+        """The largest distance of an odometry from the true position so far, m."""
+        self._pose = pose
+        self._clock = clock_of()
+        self._last: OdometryFigures | None = None
+        self._received = 0
+
+    def received(self, odometry: Odometry) -> None:
+        """Compare a message with the true pose."""
+        self._last = OdometryFigures(odometry.pose, self._pose(), 0.0)
+        self._received = self._clock.monotonic()
+        self.off_max = max(self.off_max, self._last.off)
+
+    async def watch(self, node: r2p.Node) -> None:
+        """Compare all messages of `odometry`: the function of a node."""
+        node.subscribe("odometry", Odometry, self.received, queue=1, lossy=True)
+        while True:
+            await node.spin()
+
+    @property
+    def last(self) -> OdometryFigures | None:
+        """The last one, with its age now."""
+        last = self._last
+        return last and OdometryFigures(last.pose, last.truth, (self._clock.monotonic() - self._received) / SECOND)
+
+
 class WheelFigures(msgspec.Struct, frozen=True):
     """One wheel, in rad/s and A; without a setpoint its motor is stopped."""
 
@@ -68,6 +106,13 @@ class WheelFigures(msgspec.Struct, frozen=True):
     setpoint: float | None
     speed: float
     current: float
+
+
+def wheel_figures(robot: EmulatedRobot, name: str, drive: Drive) -> WheelFigures:
+    """Return the figures of the wheel that the module `name` turns."""
+    motor = drive.motor
+    setpoint = None if drive.setpoint is None else drive.setpoint / motor.spec.ticks_per_radian
+    return WheelFigures(name, name in robot.modules, setpoint, motor.speed, motor.current)
 
 
 class RobotBusFigures(msgspec.Struct, frozen=True):
@@ -84,20 +129,14 @@ class RobotBusFigures(msgspec.Struct, frozen=True):
     """Load since the start, 0 to 1."""
 
 
-class RobotFigures(msgspec.Struct, frozen=True):
+class RobotFigures(msgspec.Struct, Generic[B], frozen=True):
     """All figures at a time, in s since the start."""
 
     time: float
-    pose: Triple
-    path: float
-    odometry: OdometryFigures | None
-    wheels: list[WheelFigures]
-    battery: tuple[float, float, float]
-    """V, A, and 0 to 1."""
+    body: B
+    """What this robot has of its own."""
     topics: list[RobotTopicFigures]
     bus: RobotBusFigures | None
-    off_max: float = 0.0
-    """The largest distance of an odometry from the true position so far, m."""
     late: float = 0.0
     """The share of periodic messages in the last second that began late, or were skipped: 0 to 1."""
     slow: float = 0.0
@@ -125,15 +164,22 @@ class _Reading(NamedTuple):
     bus: tuple[int, int, int]
 
 
-class FiguresReader:
+class FiguresReader(Generic[B]):
     """Reads the figures; rates are over at least a second, or since the first reading."""
 
-    def __init__(self, robot: Triskar2, bus: SimCan | None, modules: Iterable[r2p.Module] = ()) -> None:
-        """`modules`: other modules whose topics count. Messages from before now do not."""
-        self._odometry: OdometryFigures | None = None
-        self._heard = 0
-        self._off_max = self._slow = self._last = 0.0
-        self._clock = clock_of()
+    def __init__(
+        self,
+        robot: EmulatedRobot,
+        bus: SimCan | None,
+        body: Callable[[], B],
+        modules: Iterable[r2p.Module] = (),
+    ) -> None:
+        """`body` reads what the robot has of its own. `modules`: others whose topics count.
+
+        Messages from before now do not count.
+        """
+        self._slow = self._last = 0.0
+        self._body = body
         self._robot = robot
         self._bus = bus
         self._others = list(modules)
@@ -141,16 +187,8 @@ class FiguresReader:
         self._began = self._count(0.0)
         self._readings = deque([self._began])
 
-    def odometry_received(self, odometry: Odometry) -> None:
-        """Compare an odometry message with the true pose."""
-        self._odometry = OdometryFigures(odometry.pose, self._robot.pose, 0.0)
-        self._heard = self._clock.monotonic()
-        self._off_max = max(self._off_max, self._odometry.off)
-
-    def read(self, time: float) -> RobotFigures:
+    def read(self, time: float) -> RobotFigures[B]:
         """Return the figures; `time` is now, in s since the start."""
-        hardware = self._robot.hardware
-        battery = hardware.battery
         now = self._count(time)
         self._readings.append(now)
         while self._readings[1].time <= time - _WINDOW:
@@ -162,32 +200,17 @@ class FiguresReader:
         self._last = time
         return RobotFigures(
             time,
-            self._robot.pose,
-            hardware.body.path,
-            self._last_odometry(),
-            [self._wheel(wheel, name) for wheel, name in enumerate(MOTORS)],
-            (battery.voltage, battery.current, battery.charge),
+            self._body(),
             sorted(topics, key=lambda topic: (_URGENCY.index(topic.real_time), topic.topic)),
             None if self._bus is None else self._bus_figures(self._bus, now),
-            self._off_max,
             late,
             self._slow,
         )
-
-    def _last_odometry(self) -> OdometryFigures | None:
-        last = self._odometry
-        return last and OdometryFigures(last.pose, last.truth, (self._clock.monotonic() - self._heard) / SECOND)
 
     def _late(self, now: _Reading) -> float:
         """Return the share of late messages since the first reading that counts; 0 after a module was switched off."""
         late, count = (new - old for new, old in zip(now.periodic, self._readings[0].periodic, strict=True))
         return min(1.0, max(0, late) / count) if count > 0 else 0.0
-
-    def _wheel(self, wheel: int, name: str) -> WheelFigures:
-        drive = self._robot.hardware.drives[wheel]
-        motor = drive.motor
-        setpoint = None if drive.setpoint is None else drive.setpoint / motor.spec.ticks_per_radian
-        return WheelFigures(name, name in self._robot.modules, setpoint, motor.speed, motor.current)
 
     def _modules(self) -> list[r2p.Module]:
         return [*self._others, *self._robot.modules.values()]

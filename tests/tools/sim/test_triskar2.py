@@ -23,7 +23,7 @@ from r2p.runtime.publishers import PeriodicPublisher
 from r2p.sim import can_bus
 from r2p.sim.modules.boards import ParameterOptions
 from r2p.sim.physics.world import World, box
-from r2p.sim.robots.emulated import MOTORS, Triskar2
+from r2p.sim.robots.emulated import MODULES, MOTORS, Triskar2
 from r2p.sim.robots.figures import (
     FiguresReader,
     OdometryFigures,
@@ -33,10 +33,15 @@ from r2p.sim.robots.figures import (
     WheelFigures,
 )
 from r2p.sim.robots.triskar2 import square
-from r2p.tools import simulator
 from r2p.tools.config import Settings
 from r2p.tools.main import app
-from r2p.tools.simulator import Map, default_links, program, simulate
+from r2p.tools.output import program
+from r2p.tools.sim import screen
+from r2p.tools.sim.display import odometry_accuracy
+from r2p.tools.sim.parameters import parameter_sources
+from r2p.tools.sim.run import default_links, simulate
+from r2p.tools.sim.triskar2 import Triskar2Display, Triskar2Figures
+from r2p.tools.sim.world_map import WorldMap
 from tests.tools.rig import process
 
 if TYPE_CHECKING:
@@ -45,21 +50,24 @@ if TYPE_CHECKING:
     from r2p.bridge import BridgeOptions
 
 VIA = "sim:reader"
+DISPLAY = Triskar2Display("memory:robot", seed=0)
 
 
 @pytest.mark.virtual_time
 async def test_figures_of_a_drive() -> None:
     bus = can_bus("reader")
-    async with Triskar2(VIA, seed=1) as robot, r2p.Module("PC1", via=VIA) as pc:
+    display = Triskar2Display(VIA, seed=1)
+    async with display.robot as robot, r2p.Module("PC1", via=VIA) as pc:
         await robot.ready(10)
-        reader = FiguresReader(robot, bus, [pc])
-        pc.start(functools.partial(simulator._watch, reader=reader), name="watch")
+        reader = FiguresReader(robot, bus, display.read, [pc])
+        display.watch(pc)
         pc.start(square, 1.0, 0.4, name="square")
         await asyncio.sleep(2)
         reader.read(2.0)
         await asyncio.sleep(1)
         figures = reader.read(3.0)
-        assert figures.path == robot.hardware.body.path
+        body = figures.body
+        assert body.path == robot.hardware.body.path
     topics = {topic.topic: topic for topic in figures.topics}
     assert topics["velocity_cmd"].rate == pytest.approx(20, abs=1)
     assert topics["encoder1"].rate == pytest.approx(50, abs=2)
@@ -69,34 +77,35 @@ async def test_figures_of_a_drive() -> None:
     assert not {"log", "power", "current1"} & set(topics)
     assert figures.missed == 0
     assert (figures.late, figures.slow, figures.too_slow) == (0.0, 0.0, False)
-    assert figures.odometry is not None
-    assert figures.odometry.fresh
-    assert figures.odometry.off <= figures.off_max < 0.02
+    assert body.odometry is not None
+    assert body.odometry.fresh
+    assert body.odometry.off <= body.off_max < 0.02
     assert figures.bus is not None
     assert 0.05 < figures.bus.load < 0.5
     assert figures.bus.frames == pytest.approx(3 * figures.bus.rate, rel=0.2)
     assert figures.bus.mean == pytest.approx(figures.bus.load, rel=0.2)
     assert figures.bus.of == 60
     assert 2.0 < figures.bus.slots < 4.0  # five messages each 20 ms, in cycles of 10 ms
-    assert [wheel.setpoint for wheel in figures.wheels] == pytest.approx([4, 4, -8], abs=0.01)
-    assert [wheel.speed for wheel in figures.wheels] == pytest.approx([4, 4, -8], abs=0.3)
+    assert [wheel.setpoint for wheel in body.wheels] == pytest.approx([4, 4, -8], abs=0.01)
+    assert [wheel.speed for wheel in body.wheels] == pytest.approx([4, 4, -8], abs=0.3)
 
 
 @pytest.mark.virtual_time
 async def test_what_was_missed_before_does_not_count_and_what_is_off_says_so() -> None:
-    async with Triskar2(VIA) as robot:
+    display = Triskar2Display(VIA, seed=0)
+    async with display.robot as robot:
         await asyncio.sleep(1)
         publisher = next(iter(robot.modules["PS"].nodes["battery"].node.publishers))
         publisher.missed += 5
-        reader = FiguresReader(robot, None)
+        reader = FiguresReader(robot, None, display.read)
         publisher.missed += 2
         await robot.switch_off("MOTOR2")
         figures = reader.read(1.0)
     assert figures.missed == 2
-    assert [wheel.on for wheel in figures.wheels] == [True, False, True]
-    assert figures.odometry is None
+    assert [wheel.on for wheel in figures.body.wheels] == [True, False, True]
+    assert figures.body.odometry is None
     assert figures.bus is None
-    text = "\n".join(simulator.state(figures))
+    text = "\n".join([*display.state(figures.body), *screen.bus_lines(figures.bus)])
     assert "MOTOR2    switched off" in text
     assert "a network in memory" in text
 
@@ -106,7 +115,7 @@ async def test_a_computer_that_is_too_slow_is_told_by_late_messages() -> None:
     """And by those that were skipped; with the topics' rates it need not show."""
     async with Triskar2("memory:slow") as robot:
         await robot.ready(10)
-        reader = FiguresReader(robot, None)
+        reader = FiguresReader(robot, None, lambda: None)
         await asyncio.sleep(1)
         assert reader.read(1.0).late == 0
         (encoder,) = (each for each in robot.modules["MOTOR1"].nodes["motor"].node.publishers)
@@ -123,14 +132,14 @@ async def test_a_computer_that_is_too_slow_is_told_by_late_messages() -> None:
 
 
 def test_a_slow_computer_is_named_as_the_reason(capsys: pytest.CaptureFixture[str]) -> None:
-    screen = simulator.SimulatorScreen(World(), live=False, duration=20.0)
-    screen.show(msgspec.structs.replace(moment(), late=0.62))
-    screen.print_summary(msgspec.structs.replace(moment(), slow=2.5), fast=False)
-    shown = capsys.readouterr().out
-    assert "PC too slow: 62% late\n" in shown
-    assert "this PC was too slow for 2.5 of 3.5 s: messages were late or skipped;" in shown
-    assert shown.endswith("sim --fast\n")
-    assert max(map(len, shown.splitlines())) <= 80
+    shown = screen.SimulatorScreen(DISPLAY, live=False, duration=20.0)
+    shown.show(msgspec.structs.replace(moment(), late=0.62))
+    shown.print_summary(msgspec.structs.replace(moment(), slow=2.5), fast=False)
+    text = capsys.readouterr().out
+    assert "PC too slow: 62% late\n" in text
+    assert "this PC was too slow for 2.5 of 3.5 s: messages were late or skipped;" in text
+    assert text.endswith("sim --fast\n")
+    assert max(map(len, text.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(
@@ -140,7 +149,7 @@ def test_a_slow_computer_is_named_as_the_reason(capsys: pytest.CaptureFixture[st
 def test_position_and_odometry_are_of_one_instant(age: float, position: str, odometry: str) -> None:
     """Else what the robot drove in the meantime would look like an error of the odometry."""
     last = OdometryFigures(Pose3(0.30), (0.31, -0.01, 0.0), age)
-    lines = simulator.state(msgspec.structs.replace(moment(), pose=(0.44, 0.0, 0.0), odometry=last))
+    lines = DISPLAY.state(msgspec.structs.replace(moment().body, pose=(0.44, 0.0, 0.0), odometry=last))
     assert position in lines[0]
     assert lines[1].startswith("odometry  x   0.30  y   0.00 m")
     assert lines[1].endswith(odometry)
@@ -155,7 +164,7 @@ def test_position_and_odometry_are_of_one_instant(age: float, position: str, odo
     ],
 )
 def test_no_error_of_the_odometry_is_explained_that_is_not_there(off: float, most: float, text: str) -> None:
-    assert simulator._accuracy(OdometryFigures(Pose3(off), (0.0, 0.0, 0.0), 0.0), most) == text
+    assert odometry_accuracy(OdometryFigures(Pose3(off), (0.0, 0.0, 0.0), 0.0), most) == text
 
 
 @pytest.mark.parametrize("allowed", [True, False])
@@ -163,13 +172,13 @@ def test_what_its_gateway_takes_from_outside(monkeypatch: pytest.MonkeyPatch, al
     def robot(_via: str, *, options: BridgeOptions, **_others: object) -> Triskar2:
         raise r2p.Error(f"control: {options.allow_control}")
 
-    monkeypatch.setattr("r2p.tools.simulator.Triskar2", robot)
+    monkeypatch.setattr("r2p.tools.sim.triskar2.Triskar2", robot)
     result = CliRunner().invoke(app, ["sim", "--via", "memory:lab", *(["--allow-control"] if allowed else [])])
     assert (result.exit_code, result.stderr) == (1, f"r2p: control: {allowed}\n")
 
 
 def test_the_map_shows_walls_way_and_robot() -> None:
-    chart = Map(World(box(0, 0, 4, 4)), 20, 10)
+    chart = WorldMap(World(box(0, 0, 4, 4)), 20, 10)
     chart.draw((-1.0, 0.0, 0.0))
     lines = chart.draw((1.0, 0.0, 1.6)).splitlines()
     assert len(lines) == 10
@@ -181,7 +190,7 @@ def test_the_map_shows_walls_way_and_robot() -> None:
 
 
 def test_the_map_grows_with_the_way() -> None:
-    chart = Map(World(), 20, 10)
+    chart = WorldMap(World(), 20, 10)
     for step in range(100):
         picture = chart.draw((step / 2, 0.0, 0.0))
     assert picture.count(">") == 1
@@ -189,7 +198,7 @@ def test_the_map_grows_with_the_way() -> None:
 
 
 def test_fast_prints_a_line_each_ten_seconds_and_sums_up(capsys: pytest.CaptureFixture[str]) -> None:
-    sim.run(simulate(duration=20.0, seed=4, laps=1, fast=True, bus=True), seed=4)
+    sim.run(simulate(Triskar2Display, duration=20.0, seed=4, rounds=1, fast=True, bus=True), seed=4)
     fast = capsys.readouterr().out
     lines = fast.splitlines()
     assert max(len(line) for line in lines) <= 80
@@ -208,18 +217,18 @@ def test_the_state_fits_beside_the_map() -> None:
     wheels = [WheelFigures(f"MOTOR{n}", True, -10.0, -10.12, -10.0) for n in (1, 2, 3)]
     bus = RobotBusFigures(1.0, 7654.3, 999_999, 99, 10.5, 60)
     odometry = OdometryFigures(Pose3(-10.5, -10.5, -3.0), (-10.5, -10.377, -3.0), 0.1)
-    figures = RobotFigures(3600.0, (-10.5, -10.5, -3.0), 999.99, odometry, wheels, (25.6, 10.0, 1.0), [], bus)
-    lines = simulator.state(figures)
+    figures = Triskar2Figures((-10.5, -10.5, -3.0), 999.99, odometry, wheels, (25.6, 10.0, 1.0))
+    lines = [*DISPLAY.state(figures), *screen.bus_lines(bus)]
     assert len(lines) == 9
     assert max(len(line) for line in lines) <= 48
 
 
-def moment() -> RobotFigures:
+def moment() -> RobotFigures[Triskar2Figures]:
     """Figures of a robot at rest, with ten topics."""
     wheels = [WheelFigures(f"MOTOR{n}", True, -10.0, -10.12, -10.0) for n in (1, 2, 3)]
     bus = RobotBusFigures(0.5, 1000.0, 9999, 0, 2.5, 60)
     rows = [RobotTopicFigures(f"topic{n}", "MOTOR1", "soft: by deadline", 50.0, 1000, 1) for n in range(10)]
-    return RobotFigures(3.5, (0.0, 0.0, 0.0), 1.0, None, wheels, (25.6, 10.0, 1.0), rows, bus)
+    return RobotFigures(3.5, Triskar2Figures((0.0, 0.0, 0.0), 1.0, None, wheels, (25.6, 10.0, 1.0)), rows, bus)
 
 
 @pytest.mark.parametrize(
@@ -231,8 +240,8 @@ def test_it_fits_the_terminal_and_always_says_what_to_do(
 ) -> None:
     """A small one has no map, then fewer topics."""
     text = io.StringIO()
-    monkeypatch.setattr(simulator, "Console", functools.partial(Console, file=text, width=width, height=height))
-    shown = simulator.SimulatorScreen(World(box(0, 0, 4, 4)), duration=20.0)
+    monkeypatch.setattr(screen, "Console", functools.partial(Console, file=text, width=width, height=height))
+    shown = screen.SimulatorScreen(DISPLAY, duration=20.0)
     shown.print_hints("Try:", "  r2p topic list")
     assert text.getvalue() == "Try:\n  r2p topic list\n"
     shown.console.print(shown.draw(moment()))
@@ -250,8 +259,8 @@ def test_at_a_terminal_the_figures_stay_where_they_are(monkeypatch: pytest.Monke
     console = functools.partial(
         Console, file=text, width=80, height=24, force_terminal=True, _environ={"TERM": "xterm"}
     )
-    monkeypatch.setattr(simulator, "Console", console)
-    with simulator.SimulatorScreen(World()) as shown:
+    monkeypatch.setattr(screen, "Console", console)
+    with screen.SimulatorScreen(DISPLAY) as shown:
         shown.print_hints("Try:", "  r2p topic list")
         for _ in range(3):
             shown.show(moment())
@@ -281,7 +290,7 @@ def test_hints_can_be_pasted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fo
 @pytest.mark.processes
 def test_others_reach_it_through_its_gateway() -> None:
     """By the debug line and by zenoh, in real time, from other processes."""
-    with process("sim", "triskar2", "--square") as robot:
+    with process("sim", "triskar2", "--drive") as robot:
         assert robot.stdout is not None
         found = (re.search(r"topic echo odometry --via (\S+)", line) for line in robot.stdout)
         urls = [next(match[1] for match in found if match) for _ in default_links()]
@@ -330,7 +339,7 @@ def test_parameters_come_from_files_and_options(tmp_path: Path) -> None:
     two.write_text("[params.MOTOR1.motor]\nki = 2\n[params.OTHER.motor]\nki = 9\n")
     chosen = Settings(params={"MOTOR1": {("motor", "kd"): 1.0, ("motor", "timeout"): 1.0}})
     options = ["motor.kp=4", "MOTOR3/motor.kp=5", "limits.low_voltage=2"]
-    given = simulator.parameter_sources(chosen, [one, two], options)
+    given = parameter_sources(chosen, MODULES, [one, two], options)
 
     async def values() -> dict[str, dict[str, float]]:
         async with Triskar2("memory:given", modules=MOTORS, parameters=ParameterOptions(params=given)) as robot:

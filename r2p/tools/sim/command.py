@@ -1,0 +1,101 @@
+"""`r2p sim`: an emulated robot on a simulated RTCAN bus, which other programs reach through its gateway."""
+
+import functools
+import importlib
+import math
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from r2p.sim.modules.boards import ParameterOptions
+from r2p.tools.options import Params, ParamsFile, Quiet, Verbose, Via, time_option
+from r2p.tools.session import UsageError, check_urls, execute, run_virtually, settings
+from r2p.tools.sim.parameters import parameter_sources
+from r2p.tools.sim.run import default_links, simulate
+
+if TYPE_CHECKING:
+    from r2p.tools.sim.display import RobotDisplay
+
+_FAST = 60.0  # seconds
+
+_Name = Literal["triskar2"]
+_DISPLAYS: dict[_Name, str] = {"triskar2": "Triskar2Display"}
+"""The display of each robot, in a module with its name."""
+_ROBOTS = "triskar2: the omnidirectional robot of the thesis."
+
+_Speed = Annotated[
+    float | None,
+    typer.Option(metavar="N", min=0.1, max=100.0, help="N times as fast as real time; ROS nodes follow its /clock."),
+]
+_Drive = Annotated[bool, typer.Option("--drive", help="Let a PC drive it, to look at it; implied by --fast.")]
+_Fast = Annotated[
+    bool, typer.Option("--fast", help="As fast as possible, in virtual time; other programs can't connect.")
+]
+
+
+def command(
+    robot: Annotated[_Name, typer.Argument(metavar="ROBOT", help=_ROBOTS)] = "triskar2",
+    fast: _Fast = False,
+    speed: _Speed = None,
+    duration: Annotated[
+        float | None, time_option("--duration", "How long; default: until Ctrl-C; --fast: 60 s.")
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of all random numbers.")] = 0,
+    drive: _Drive = False,
+    bus: Annotated[bool, typer.Option("--bus", help="At the end, report how much each node sent on the bus.")] = False,
+    allow_control: Annotated[
+        bool, typer.Option("--allow-control", help="Let the gateway accept REBOOT, BOOTLOAD and changes from IP links.")
+    ] = False,
+    params_file: ParamsFile = None,
+    params: Params = None,
+    param: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[MODULE/]NODE.NAME=VALUE", help="Start with this value of a parameter (repeatable)."),
+    ] = None,
+    via: Via = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = 0,
+) -> None:
+    """Run an emulated robot: modules, motors, a body that moves, and a gateway for other programs.
+
+    The gateway opens the links of --via; by default the debug line on TCP, and zenoh, for this computer only.
+    """
+
+    async def main() -> None:
+        if fast and speed is not None:
+            raise UsageError("--fast is as fast as possible: leave out either --fast or --speed")
+        if fast and via:
+            raise UsageError("--fast runs in virtual time, so other programs can't connect: leave out --via or --fast")
+        check_urls(via or [])
+        chosen = settings()
+        display = display_of(robot)
+        sources = parameter_sources(chosen, display.robot_class.names, params or (), param or ())
+        parameters = ParameterOptions(params=sources, params_file=params_file or chosen.params_file)
+        await simulate(
+            display,
+            duration=duration or (_FAST if fast else None),
+            seed=seed,
+            outside=() if fast else tuple(via or default_links()),
+            rounds=math.inf if drive or fast else 0,
+            fast=fast,
+            bus=bus,
+            allow_control=allow_control,
+            parameters=parameters,
+        )
+
+    virtually = functools.partial(run_virtually, seed=seed, speed=None if fast else speed)
+    # Only errors are logged: any other line would tear the display apart.
+    endless = duration is None and not fast
+    execute(
+        main,
+        verbose=verbose,
+        quiet=quiet + 2,
+        endless=endless,
+        run=virtually if fast or speed is not None else None,
+    )
+
+
+def display_of(robot: _Name) -> "type[RobotDisplay[Any]]":
+    """Import the display of a robot."""
+    display: type[RobotDisplay[Any]] = getattr(importlib.import_module(f"r2p.tools.sim.{robot}"), _DISPLAYS[robot])
+    return display
