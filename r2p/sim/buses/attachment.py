@@ -1,0 +1,165 @@
+"""What a program has of a simulated bus: one controller, which any thread may use, with calls that wait.
+
+`python_can` puts python-can's interface around a `BusAttachment`. There are two kinds: `local` to a bus of this
+process, `served` to one of another process. Neither knows python-can.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import msgspec
+
+from r2p.codecs.can_bits import Frame, OtherFrame
+from r2p.errors import MessageError
+from r2p.sim.can import ControllerState, ErrorKind
+
+TX_QUEUE = 128
+"""Frames that wait for the wire in an attachment; those that the controller holds count as well."""
+
+RX_QUEUE = 10_000
+"""Frames that wait for `receive`, unless the options say otherwise: half a second of the shortest ones at 1 Mbit/s."""
+
+BITRATE = 1_000_000
+"""Bit/s of a bus that is made by an attachment which asks for no bit rate."""
+
+
+class BusFilter(msgspec.Struct, frozen=True):
+    """Passes frames with `id & mask == value & mask`; `extended` chooses 29 bits, or 11, None takes both."""
+
+    value: int
+    mask: int
+    extended: bool | None = None
+
+    def passes(self, frame: Frame | OtherFrame) -> bool:
+        """Return whether a frame passes."""
+        extended = type(frame) is Frame or frame.extended  # type: ignore[union-attr]
+        return not (frame.id ^ self.value) & self.mask and self.extended in (None, extended)
+
+
+class AttachmentOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How to attach to a bus.
+
+    For the bus, if this attachment makes it: `noise`, the share of frames with a bit error, and `seed`. `bitrate`
+    (bit/s) is that of the bus that is made; if there is one already, its bit rate has to be this one. None: any.
+
+    For the node, as in `CanNode`: `name` (followed by a number if it is in use), `one_shot`, `offset` (ns) and
+    `drift_ppm` of its clock, `loss`. `listen_only`: it sends nothing, no acknowledge either, so that the bus is as it
+    is without it.
+
+    For what is received: `own` frames too, when they have been sent; `errors`: error frames and changes of the
+    controller's state; `filters`: frames that pass one of them, or all if there is none; `rx_queue`: how many frames
+    wait, at most, and the oldest ones are dropped for newer ones.
+
+    `served`: True takes a bus of another process only, False none of another process. None: whichever there is.
+    """
+
+    bitrate: int | None = None
+    noise: float = 0.0
+    seed: int | None = None
+    name: str = "python-can"
+    one_shot: bool = False
+    offset: int = 0
+    drift_ppm: float = 0.0
+    loss: float = 0.0
+    listen_only: bool = False
+    own: bool = False
+    errors: bool = True
+    filters: tuple[BusFilter, ...] = ()
+    rx_queue: int = RX_QUEUE
+    served: bool | None = None
+
+    def __post_init__(self) -> None:
+        if self.bitrate is not None and (self.bitrate <= 0 or 1_000_000_000 % self.bitrate):
+            raise MessageError(f"at {self.bitrate} bit/s a bit does not take whole nanoseconds")
+        for name, share in (("noise", self.noise), ("loss", self.loss)):
+            if not 0.0 <= share <= 1.0:
+                raise MessageError(f"{name} is a share, 0.0 to 1.0, not {share}")
+        if self.rx_queue < 1:
+            raise MessageError(f"at least one frame has to fit the queue of received frames, not {self.rx_queue}")
+
+
+class BusFrame(msgspec.Struct, frozen=True, gc=False):
+    """An event on the bus, as an attachment receives it.
+
+    With neither `error` nor `state`: a good `frame`; `own`, if this attachment has sent it. With `error`: an attempt to
+    send `frame` was destroyed, and `end` is the end of the error frame. With `state`: this controller's state is
+    another one; there is no frame.
+
+    `end` is the instant by the clock of this node (ns), `utc` the same since 1970: of one bus, differences of both are
+    exact. The error counters are this controller's; they count where there is an error or a state.
+    """
+
+    frame: Frame | OtherFrame | None
+    end: int
+    utc: int
+    own: bool = False
+    error: ErrorKind | None = None
+    state: ControllerState | None = None
+    tx_errors: int = 0
+    rx_errors: int = 0
+
+
+class BusAttachment(ABC):
+    """One controller at a bus. All methods may be called from any thread, at once.
+
+    They raise `Closed` after `close`, and `TransportError` with the reason when the bus has ended.
+    """
+
+    description: str
+    """Where the bus is, for people: "lab: a bus of this process, 1000000 bit/s"."""
+    bitrate: int
+    """Bit/s."""
+
+    @abstractmethod
+    def send(self, frame: Frame | OtherFrame, timeout: float | None = None) -> None:
+        """Put a frame into the queue of `TX_QUEUE` frames, which leave it in this order; wait for room.
+
+        `timeout` in seconds, 0 does not wait; None waits as long as frames leave the queue at all. Raises TimeoutError
+        when there is no room in time, `TransportError` in bus-off, and if the attachment is listen-only.
+        """
+
+    @abstractmethod
+    def receive(self, timeout: float | None = None) -> BusFrame | None:
+        """Return the next event; None if there is none in time. `timeout` in seconds, None waits forever.
+
+        In the thread of the event loop that runs the bus, no frame would arrive while this waits, so a timeout other
+        than 0 raises `Error` there if the queue is empty.
+        """
+
+    @abstractmethod
+    def set_filters(self, filters: Sequence[BusFilter]) -> None:
+        """Receive frames that pass one of these, from now on; all if there is none. Errors always pass."""
+
+    @property
+    @abstractmethod
+    def state(self) -> ControllerState:
+        """The state of the controller."""
+
+    @property
+    @abstractmethod
+    def error_counters(self) -> tuple[int, int]:
+        """The transmit and receive error counters of the controller."""
+
+    @property
+    @abstractmethod
+    def lost(self) -> int:
+        """Frames that were dropped because nothing received them in time; the log reports the first one."""
+
+    @abstractmethod
+    def flush(self) -> None:
+        """Drop the frames that wait for the wire; one whose start of frame has begun is sent."""
+
+    @abstractmethod
+    def restart(self) -> None:
+        """Leave bus-off now, with the error counters at 0. Nothing happens in another state."""
+
+    @abstractmethod
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while `receive(0)` has an event; it is closed by `close`."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave the bus: the controller loses its power, frames that wait are dropped. Calls that wait raise `Closed`.
+
+        May be called again.
+        """
