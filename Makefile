@@ -7,6 +7,9 @@ STAMP := .venv/stamp
 LOWEST := .venv-lowest
 PYTHONS := 3.12 3.13
 
+# Tests start hundreds of Pythons, and each of them would compile all of r2p.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-lowest test-pythons lint bench soak docs docs-check pictures page-pictures clean
 
 demo: $(RUN)

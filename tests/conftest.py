@@ -6,6 +6,7 @@ real threads: it runs twice, on asyncio's loop and on uvloop's.
 
 from __future__ import annotations
 
+import gc
 import logging
 import signal
 import sys
@@ -33,6 +34,17 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(plugin, "r2p")
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's job in the background: nobody would obey Ctrl-C
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect without the garbage collector, and have it pass over the tests later: they stay until the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 class _Kept(logging.Handler):
