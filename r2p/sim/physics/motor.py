@@ -77,6 +77,8 @@ class Motor:
         """Speed of the wheel, rad/s."""
         self.current_limit = spec.current_limit
         """A; above it the bridge chops the current."""
+        self.regulated: float | None = None
+        """The current that the bridge regulates as far as its supply reaches, A; None: `voltage` counts."""
         self._constant = spec.constant
         self._ticks_per_radian = spec.ticks_per_radian
         self._dry, self._damping = spec.friction * 1e-3, spec.damping * 1e-3
@@ -88,19 +90,24 @@ class Motor:
 
     def torque(self) -> float:
         """Return the torque on the wheel at its present speed, including friction, Nm."""
-        limit = self.current_limit
-        current = (self.voltage - self._constant * self.speed) / self.spec.resistance
+        return self.torque_at(self.speed)
+
+    def torque_at(self, speed: float) -> float:
+        """Return the torque on the wheel at any speed (rad/s), including friction, Nm."""
+        limit, constant, resistance = self.current_limit, self._constant, self.spec.resistance
+        if self.regulated is not None:
+            supply = self.spec.voltage
+            wanted = self.regulated * resistance + constant * speed
+            self.voltage = max(-supply, min(supply, wanted))
+        current = (self.voltage - constant * speed) / resistance
         self.current = current = max(-limit, min(limit, current))
-        return current * self._constant - self._friction()
+        dry = self._dry and self._dry * max(-1.0, min(1.0, speed * 10))  # from 0.1 rad/s on, so that it never drives
+        return current * constant - dry - self._damping * speed
 
     def turn(self, speed: float, dt: float) -> None:
         """Turn the wheel for `dt` seconds, at the end of which it has this speed (rad/s)."""
         self.angle += (self.speed + speed) / 2 * dt
         self.speed = speed
-
-    def _friction(self) -> float:
-        """Return the friction, Nm: dry friction grows up to 0.1 rad/s, so that it never drives the wheel."""
-        return self._dry * max(-1.0, min(1.0, self.speed * 10)) + self._damping * self.speed
 
 
 class Axle:

@@ -216,3 +216,17 @@ def test_a_charger_fills_it_and_no_more() -> None:
     for _ in range(1000):
         battery.step(1.0)
     assert battery.charge == 1.0
+
+
+def test_a_regulated_current_gives_its_torque_at_any_speed_that_the_supply_reaches() -> None:
+    motor = Motor(SMOOTH)
+    motor.regulated = 2.0
+    free = [motor.torque_at(speed) + SMOOTH.damping * 1e-3 * speed for speed in (0.0, 10.0, -10.0)]
+    assert free == pytest.approx([2.0 * SMOOTH.constant] * 3)
+    assert motor.voltage == pytest.approx(2.0 * SMOOTH.resistance - 10.0 * SMOOTH.constant)
+    top = SMOOTH.voltage / SMOOTH.constant  # rad/s: all of the supply is back EMF
+    assert motor.torque_at(top) + SMOOTH.damping * 1e-3 * top == pytest.approx(0.0, abs=1e-9)
+    assert motor.voltage == SMOOTH.voltage
+    motor.regulated = 50.0
+    motor.torque_at(0.0)
+    assert motor.current == motor.current_limit
