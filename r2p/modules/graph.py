@@ -27,7 +27,7 @@ from r2p.parameters.definition import ParameterInfo
 from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.sample import PublisherClass
-from r2p.runtime.topic import Topic
+from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.link import Link
 from r2p.units import SECOND
 from r2p.version import __version__
@@ -119,7 +119,8 @@ class NetworkView:
             if not topic.unused:
                 _add_own(views.setdefault(topic.name, TopicView(topic.name)), topic, module.space.module)
         for link in module.links:
-            _add_discovered(views, link, module.space.clock.monotonic())
+            _add_discovered(views, link)
+        _set_ages(views, module.space)
         return dict(sorted(views.items()))
 
     def nodes(self) -> dict[tuple[str, str], tuple[list[str], list[str]]]:
@@ -282,6 +283,25 @@ class NetworkView:
         return min(found, key=lambda each: (each.kind == "ROS", each.age), default=None)  # it may be seen as both
 
 
+class TopicLooks:
+    """The topics of a network for a caller that looks at them again and again: cheap while none of them changes."""
+
+    def __init__(self, network: NetworkView, space: TopicSpace) -> None:
+        self._network = network
+        self._space = space
+        self._facts: dict[object, object] = {}
+        self._views: dict[str, TopicView] = {}
+
+    def look(self) -> dict[str, TopicView]:
+        """Return the topics by name, in order: the same objects as before, unless more than ages has changed."""
+        facts = _facts(self._space)
+        if facts == self._facts:
+            _set_ages(self._views, self._space)
+        else:
+            self._facts, self._views = facts, self._network.topics()
+        return self._views
+
+
 def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:
     state = _state(info.flags, observer=info.observer)
     age = (now - info.last_heard) / SECOND
@@ -301,7 +321,6 @@ def _state(flags: int, *, observer: bool) -> str:
 
 def _add_own(view: TopicView, topic: Topic, module: str) -> None:
     """Add the topics and nodes of this module."""
-    view.age = 0.0
     view.layout = topic.layout
     if topic.layout is not None:
         view.size, view.fingerprint = topic.layout.size, topic.layout.fingerprint
@@ -314,7 +333,7 @@ def _add_own(view: TopicView, topic: Topic, module: str) -> None:
         view.subscribed_on.append("")
 
 
-def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
+def _add_discovered(views: dict[str, TopicView], link: Link) -> None:
     """Add the topics and nodes that the discovery of a link has found."""
     for info in link.discovery.topics.values():
         view = views.setdefault(info.name, TopicView(info.name))
@@ -327,9 +346,6 @@ def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
             _add(view.published_on, link.name)
         if info.requested_at is not None:
             _add(view.subscribed_on, link.name)
-        announced = max(info.advertised_at or 0, info.requested_at or 0)
-        age = (now - announced) / SECOND
-        view.age = age if view.age is None else min(view.age, age)
     names = {info.instance: info.name for info in link.discovery.modules.values()}
     named = {(each.node, each.topic, each.role) for each in link.discovery.endpoints.values() if _module(each, names)}
     for endpoint in link.discovery.endpoints.values():
@@ -340,6 +356,47 @@ def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
         publishes = endpoint.role == ROLE_PUBLISHES
         klass = _CLASSES[endpoint.publisher_class & 3] if publishes else None  # a byte from outside
         (view.publishers if publishes else view.subscribers).append(Endpoint(module, endpoint.node, klass, link.name))
+
+
+def _set_ages(views: dict[str, TopicView], space: TopicSpace) -> None:
+    """Set the time since each topic was last announced, on any link."""
+    now, announced = space.clock.monotonic(), dict[str, int]()
+    for topic in space.topics.values():
+        if not topic.unused:
+            announced[topic.name] = now
+    for link in space.links:
+        for info in link.discovery.topics.values():
+            at = max(info.advertised_at or 0, info.requested_at or 0)
+            announced[info.name] = max(at, announced.get(info.name, 0))
+    for name, view in views.items():
+        view.age = (now - announced[name]) / SECOND if name in announced else None
+
+
+def _facts(space: TopicSpace) -> dict[object, object]:
+    """Return everything that views of topics show, except for their ages. Repeated announcements change only orders."""
+    facts: dict[object, object] = {
+        topic.name: (
+            topic.layout,
+            [(each.node.name, each.publisher_class) for each in topic.publishers],
+            [each.owner for each in topic.queues],
+        )
+        for topic in space.topics.values()
+    }
+    for link in space.links:
+        topics = {
+            name: (
+                info.size,
+                info.varies,
+                info.fingerprint,
+                info.mismatch,
+                info.type_name,
+                info.advertised_at is None,
+                info.requested_at is None,
+            )
+            for name, info in link.discovery.topics.items()
+        }
+        facts[link] = link.name, link.discovery.generation, topics
+    return facts
 
 
 def _module(endpoint: EndpointInfo, names: dict[int | None, str]) -> str:

@@ -5,7 +5,6 @@ goes back or is not a number only costs the rates.
 """
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from typing import TypeVar
@@ -38,21 +37,21 @@ EndpointName = tuple[str, str]
 """A node and a topic, by the names that their module has for them."""
 
 
-class PublisherCount(msgspec.Struct, frozen=True):
+class PublisherCount(msgspec.Struct, eq=False):
     """What a node has published on a topic. `rate` is known from the second answer on, before that None."""
 
-    sent: int
-    missed: int
-    late: int
-    rate: float | None
+    sent: int = 0
+    missed: int = 0
+    late: int = 0
+    rate: float | None = None
     publisher_class: str | None = None
 
 
-class SubscriberCount(msgspec.Struct, frozen=True):
+class SubscriberCount(msgspec.Struct, eq=False):
     """What waits for a node in its subscription of a topic, and what that has lost, by reason."""
 
-    waiting: int
-    lost: Mapping[str, int]
+    waiting: int = 0
+    lost: Mapping[str, int] = _NONE
 
 
 class ModuleCounters:
@@ -71,6 +70,9 @@ class ModuleCounters:
         """The share of a processor core."""
         self.publishers: dict[EndpointName, PublisherCount] = {}
         self.subscribers: dict[EndpointName, SubscriberCount] = {}
+        """Counts, of publishers as well, are updated in place."""
+        self.endpoint_revision = 0
+        """A number that changes when there are other publishers or subscribers."""
         self.nodes: dict[str, tuple[bool, int]] = {}
         """Whether each node runs, and how often it was restarted."""
         self.services: dict[EndpointName, ServiceStatistics] = {}
@@ -90,9 +92,10 @@ class ModuleCounters:
         self.cpu = None
         self._rates.clear()
         self._time = None
-        self.publishers = {key: msgspec.structs.replace(each, rate=None) for key, each in self.publishers.items()}
+        for each in self.publishers.values():
+            each.rate = None
         unknown = dict.fromkeys(("sent", "received", "bytes_sent", "bytes_received"))
-        self.links = {key: msgspec.structs.replace(each, **unknown) for key, each in self.links.items()}
+        self.links = {key: msgspec.structs.replace(link, **unknown) for key, link in self.links.items()}
 
     def update(self, module: str, statistics: ModuleStatistics, room: int) -> None:
         """Enter an answer, of which at most `room` entries are kept."""
@@ -114,7 +117,6 @@ class ModuleCounters:
         self._update_topics(statistics, limited)
         self.entries, self.left_out = limited.taken, limited.left_out
         self._time = time if self.uptime is not None else None
-        self._aliases = {}
 
     # Look-ups by names that others have for the module's topics
 
@@ -167,27 +169,33 @@ class ModuleCounters:
     def _update_publishers(
         self, entries: Iterable[PublisherStatistics], before: dict[tuple[str, ...], CounterRate], time: float
     ) -> None:
-        sums: dict[EndpointName, list[int]] = {}
-        classes: dict[EndpointName, str | None] = {}
+        sums: dict[EndpointName, PublisherStatistics] = {}
         for each in entries:
-            classes[each.node, each.topic] = _class_name(each.publisher_class)
-            known = sums.setdefault((each.node, each.topic), [0, 0, 0])
-            known[0] += each.sent
-            known[1] += each.missed
-            known[2] += each.late
-        self.publishers = {
-            key: PublisherCount(
-                clamp(sent), clamp(missed), clamp(late), self._rate(key, time, sent, before), classes[key]
-            )
-            for key, (sent, missed, late) in sums.items()
-        }
+            key = each.node, each.topic
+            sums[key] = each if key not in sums else _sum(sums[key], each)
+        counts = {key: self.publishers.get(key) or PublisherCount() for key in sums}
+        for key, each in sums.items():
+            count = counts[key]
+            count.sent, count.missed, count.late = clamp(each.sent), clamp(each.missed), clamp(each.late)
+            count.rate = self._rate(key, time, each.sent, before)
+            count.publisher_class = _CLASS_NAMES.get(each.publisher_class)  # a later r2p may have others
+        self._note_endpoints(self.publishers, counts)
+        self.publishers = counts
 
     def _update_subscribers(self, entries: Iterable[SubscriberStatistics]) -> None:
-        self.subscribers = {}
+        counts: dict[EndpointName, SubscriberCount] = {}
         for each in entries:
-            counts = ((reason, clamp(getattr(each, name))) for reason, name in _SUBSCRIBER_LOSSES.items())
-            lost = {reason: count for reason, count in counts if count}
-            self.subscribers[each.node, each.topic] = SubscriberCount(each.waiting, lost)
+            key = each.node, each.topic
+            count = counts[key] = self.subscribers.get(key) or SubscriberCount()
+            count.waiting = each.waiting
+            count.lost = _subscriber_losses(each)
+        self._note_endpoints(self.subscribers, counts)
+        self.subscribers = counts
+
+    def _note_endpoints(self, before: Mapping[EndpointName, object], now: Mapping[EndpointName, object]) -> None:
+        if before.keys() != now.keys():
+            self.endpoint_revision += 1
+            self._aliases = {}
 
     def _update_nodes(self, statistics: ModuleStatistics, limited: "_Room") -> None:
         self.nodes = {printable(each.node): (each.running, each.restarts) for each in limited.take(statistics.nodes)}
@@ -210,18 +218,21 @@ class ModuleCounters:
             self.links[row.name] = row
 
     def _update_topics(self, statistics: ModuleStatistics, limited: "_Room") -> None:
-        lost = Counter[str]()
+        lost: dict[str, int] = {}
         laxity: dict[str, float] = {}
         for each in limited.take(statistics.topics):
-            lost[each.topic] += each.lost
+            if each.lost:
+                lost[each.topic] = lost.get(each.topic, 0) + each.lost
             if math.isfinite(each.least_laxity):
                 least = each.least_laxity * _PER_SECOND
                 laxity[each.topic] = min(least, laxity.get(each.topic, math.inf))
         for route in limited.take(statistics.forwarded):
-            lost[route.topic] += route.dropped
+            if route.dropped:
+                lost[route.topic] = lost.get(route.topic, 0) + route.dropped
         for (_, topic), count in self.subscribers.items():
-            lost[topic] += sum(count.lost.values())
-        self.lost, self.laxity = +lost, laxity
+            if count.lost:
+                lost[topic] = lost.get(topic, 0) + sum(count.lost.values())
+        self.lost, self.laxity = lost, laxity
 
 
 class _Room:
@@ -239,17 +250,31 @@ class _Room:
         return islice(entries, kept)
 
 
-_SUBSCRIBER_LOSSES = {"queue full": "lost", "undecodable": "undecodable", "too long": "too_long", "stale": "stale"}
+_CLASS_NAMES = {int(number): name for number, name in CLASS_NAMES.items()}
 
 
 def clamp(count: int) -> int:
     """Return a sum over modules, within what JSON can have."""
-    return min(count, COUNT_MAX)
+    return count if count <= COUNT_MAX else COUNT_MAX  # noqa: FURB136 - called for each counter: `min` takes longer
 
 
-def _class_name(number: int) -> str | None:
-    known = (name for publisher_class, name in CLASS_NAMES.items() if publisher_class == number)
-    return next(known, None)  # a later r2p may have others
+def _sum(one: PublisherStatistics, other: PublisherStatistics) -> PublisherStatistics:
+    """Return the counts of two publishers of one node and topic together, of the class of the latter."""
+    totals = one.sent + other.sent, one.missed + other.missed, one.late + other.late
+    return PublisherStatistics(other.topic, other.node, other.publisher_class, *totals)
+
+
+def _subscriber_losses(each: SubscriberStatistics) -> Mapping[str, int]:
+    lost = {}
+    if each.lost:
+        lost["queue full"] = clamp(each.lost)
+    if each.undecodable:
+        lost["undecodable"] = clamp(each.undecodable)
+    if each.too_long:
+        lost["too long"] = clamp(each.too_long)
+    if each.stale:
+        lost["stale"] = clamp(each.stale)
+    return lost
 
 
 def _reasons(counts: Iterable[ReasonCount]) -> dict[str, int]:

@@ -3,13 +3,13 @@
 import asyncio
 import contextlib
 import functools
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Self
 
-from r2p.codecs.services import is_of_service
 from r2p.errors import Closed, InvalidName
 from r2p.log_lines import get_logger
-from r2p.modules.graph import TopicView
+from r2p.modules.graph import TopicLooks, TopicView
 from r2p.modules.module import Module
 from r2p.modules.statistics import ModuleStatistics
 from r2p.monitoring.buses import BusTables
@@ -18,7 +18,9 @@ from r2p.monitoring.measuring import MeasuredTopic
 from r2p.monitoring.polling import StatisticsPolling, can_be_asked
 from r2p.monitoring.rows import (
     FigureSources,
-    TopicRows,
+    KnownTopics,
+    TopicRow,
+    TypeNames,
     keep_equal,
     link_rows,
     module_rows,
@@ -66,7 +68,12 @@ class NetworkMonitor:
         self._changed = asyncio.Event()
         self._node = Node(_NODE, module.space)
         self._sources = FigureSources(BusTables(module, self._node), self.types)
-        self._topic_rows = TopicRows(self._sources)
+        self._type_names = TypeNames(self.types)
+        self._looks = TopicLooks(module.network, module.space)
+        self._views: Mapping[str, TopicView] = {}
+        self._topics = KnownTopics.of({})
+        self._topic_rows: list[tuple[TopicView, TopicRow]] = []
+        self._counted: object = None
         self._polling = StatisticsPolling(module, period)
         self._polls: dict[str, asyncio.Task[None]] = {}
         self._learning: asyncio.Task[None] | None = None
@@ -160,22 +167,19 @@ class NetworkMonitor:
         buses = sources.buses.look()
         modules = network.modules()
         self._poll({view.name for view in modules if can_be_asked(view)})
-        topics = {name: view for name, view in network.topics().items() if not self._is_own_wish(view)}
-        left_out = max(0, len(topics) - TOPICS_MAX)
-        if left_out:
-            topics = dict(list(topics.items())[:TOPICS_MAX])
-        sources.sum_up(topics)
-        self._learn(topics)
+        topics = self._look()
+        sources.sum_up(topics.views)
+        self._learn(topics.views)
         before = self.snapshot
         self.snapshot = NetworkSnapshot(
             time=self._clock.now(),
             network=", ".join(link.name for link in self._module.links),
             modules=keep_equal(before.modules, module_rows(modules, topics, sources)),
             topics=await self._collect_topics(topics),
-            services=keep_equal(before.services, service_rows(topics, sources, self._topic_rows)),
+            services=keep_equal(before.services, service_rows(topics, sources, self._type_names)),
             links=keep_equal(before.links, link_rows(sources.counters)),
             buses=keep_equal(before.buses, buses),
-            topics_left_out=left_out,
+            topics_left_out=topics.left_out,
         )
         self._is_early = self._is_early and self._has_just_begun()
         changed, self._changed = self._changed, asyncio.Event()
@@ -196,21 +200,35 @@ class NetworkMonitor:
             and all(not each.link and each.node == _NODE for each in view.subscribers)
         )
 
-    async def _collect_topics(self, topics: dict[str, TopicView]) -> list[TopicFigures]:
+    def _look(self) -> KnownTopics:
+        """Return the topics of now: the same object as before, if only ages have changed."""
+        views = self._looks.look()
+        if views is not self._views:
+            self._views = views
+            shown = [(name, view) for name, view in views.items() if not self._is_own_wish(view)]
+            self._topics = KnownTopics.of(dict(shown[:TOPICS_MAX]), max(0, len(shown) - TOPICS_MAX))
+        return self._topics
+
+    async def _collect_topics(self, topics: KnownTopics) -> list[TopicFigures]:
         """Return the rows of topics, in several turns of the event loop."""
-        before = {row.name: row for row in self.snapshot.topics}
+        counted = topics, self._sources.endpoint_revisions()
+        if counted != self._counted:
+            self._counted = counted
+            before = {row.name: row for row in self.snapshot.topics}
+            self._topic_rows = [
+                (view, TopicRow(view, self._sources, before.get(name), is_of_service=name in topics.of_services))
+                for name, view in topics.views.items()
+            ]
         rows: list[TopicFigures] = []
-        for view in topics.values():
-            row = self._topic_rows.row(view, is_of_service=is_of_service(view.name, topics))
-            known = before.get(view.name)
-            rows.append(row if known is None or known != row else known)
+        for view, row in self._topic_rows:
+            rows.append(row.update(self._type_names.name(view)))
             if len(rows) % _AT_ONCE == 0:
                 await asyncio.sleep(0)
         return rows
 
     # Types
 
-    def _learn(self, topics: dict[str, TopicView]) -> None:
+    def _learn(self, topics: Mapping[str, TopicView]) -> None:
         """Ask for types that are unknown, one after the other, unless that is being done."""
         if self._learning is not None and not self._learning.done():
             return

@@ -5,7 +5,8 @@ A row that is equal to the one before is the same object, so who shows it sees a
 
 import contextlib
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Set as AbstractSet
+from typing import Any, Self, TypeVar
 
 import msgspec
 
@@ -15,7 +16,7 @@ from r2p.errors import MessageError
 from r2p.messages import layout
 from r2p.modules.graph import Endpoint, ModuleView, TopicView
 from r2p.monitoring.buses import BusTables
-from r2p.monitoring.counters import ModuleCounters, clamp, network_name
+from r2p.monitoring.counters import ModuleCounters, PublisherCount, SubscriberCount, clamp, network_name
 from r2p.monitoring.measuring import MeasuredTopic
 from r2p.monitoring.snapshot import (
     CLASS_NAMES,
@@ -33,6 +34,31 @@ from r2p.monitoring.topic_types import TypeFinder
 F = TypeVar("F", bound=Figures)
 
 _AGE_STEP = 10  # s
+
+
+class KnownTopics(msgspec.Struct, frozen=True, eq=False):
+    """The topics of a snapshot, and what follows from their names and endpoints: found out once for many snapshots."""
+
+    views: Mapping[str, TopicView]
+    left_out: int
+    services: Mapping[str, tuple[TopicView, TopicView]]
+    """The topics of requests and of responses, by the name of their service."""
+    of_services: AbstractSet[str]
+    """The names of these topics."""
+    nodes: Mapping[str, Mapping[str, NodeFigures]]
+    """The nodes by module and name, and their topics."""
+
+    @classmethod
+    def of(cls, views: Mapping[str, TopicView], left_out: int = 0) -> Self:
+        """Return these topics."""
+        bases = (name.removesuffix(RESPONSES) for name in views if name.endswith(RESPONSES))
+        services = {
+            base: (views[f"{base}{REQUESTS}"], views[f"{base}{RESPONSES}"])
+            for base in bases
+            if f"{base}{REQUESTS}" in views
+        }
+        of_services = {view.name for pair in services.values() for view in pair}
+        return cls(views, left_out, services, of_services, _nodes_by_module(views.values()))
 
 
 class FigureSources(msgspec.Struct, eq=False):
@@ -59,43 +85,19 @@ class FigureSources(msgspec.Struct, eq=False):
                 name = network_name(module, topic, topics)
                 self.laxity[name] = min(laxity, self.laxity.get(name, laxity))
 
+    def endpoint_revisions(self) -> list[tuple[ModuleCounters, int]]:
+        """Return what is equal for as long as the modules have counts of the same publishers and subscribers."""
+        return [(each, each.endpoint_revision) for each in self.counters.values()]
 
-class TopicRows:
-    """Makes the rows of topics, one by one."""
 
-    def __init__(self, sources: FigureSources) -> None:
-        self._sources = sources
-        self._names: dict[bytes, str | None] = {}
+class TypeNames:
+    """What the types of topics are called."""
 
-    def row(self, view: TopicView, *, is_of_service: bool) -> TopicFigures:
-        """Return the figures of a topic."""
-        publishers, counted = self._publishers(view)
-        subscribers, some_known = self._subscribers(view)
-        figures = TopicFigures(
-            view.name,
-            type=self.type_name(view),
-            size=view.size or None,
-            varies=view.varies,
-            mismatch=view.mismatch,
-            age=None if view.age is None else view.age // _AGE_STEP * _AGE_STEP,
-            publishers=publishers,
-            subscribers=subscribers,
-            laxity=self._sources.laxity.get(view.name),
-            is_of_service=is_of_service,
-        )
-        known = [each for each in counted.values() if each is not None and each.sent is not None]
-        if known:
-            figures.missed = clamp(sum(each.missed or 0 for each in known))
-            figures.late = clamp(sum(each.late or 0 for each in known))
-        if known or some_known:
-            figures.lost_on_way = self._sources.lost.get(view.name, 0)
-        measured = self._sources.measured.get(view.name)
-        if measured is not None:
-            _enter_measured(figures, measured)
-        self._enter_rate(figures, view, counted, measured)
-        return figures
+    def __init__(self, types: TypeFinder) -> None:
+        self._types = types
+        self._names: dict[bytes, str] = {}
 
-    def type_name(self, view: TopicView) -> str | None:
+    def name(self, view: TopicView) -> str | None:
         """Return what the type of a topic is called; ROS nodes that have the topic decide."""
         if view.ros_type:
             return view.ros_type
@@ -105,63 +107,89 @@ class TopicRows:
             return None
         name = self._names.get(view.fingerprint)
         if name is None:
-            cls = self._sources.types.by_fingerprint(view.fingerprint)
+            cls = self._types.by_fingerprint(view.fingerprint)
             if cls is not None:
                 name = self._names[view.fingerprint] = layout(cls).name
         return name
 
-    def _publishers(
-        self, view: TopicView
-    ) -> tuple[list[PublisherFigures], dict[tuple[str, str], PublisherFigures | None]]:
-        """Return the rows of publishers, and those to count: one of each node, however many links it is seen on."""
-        rows: list[PublisherFigures] = []
-        counted: dict[tuple[str, str], PublisherFigures | None] = {}
-        for each in view.publishers:
-            row = self._publisher(view.name, each)
-            rows.append(row)
-            counted[each.module, each.node] = row
-        seen = {each.link for each in view.publishers}
-        for link in view.published_on:
-            if link not in seen:  # firmware, which does not say which node it is
-                counted["", link] = None
-        return rows, counted
 
-    def _publisher(self, topic: str, endpoint: Endpoint) -> PublisherFigures:
-        klass = endpoint.publisher_class
-        row = PublisherFigures(
-            endpoint.module, endpoint.node, endpoint.link, None if klass is None else CLASS_NAMES[klass]
-        )
-        counters = self._sources.counters.get(endpoint.module)
-        count = None if counters is None else counters.publisher(endpoint.module, endpoint.node, topic)
-        if count is not None:
-            row.rate, row.sent, row.missed, row.late = count.rate, count.sent, count.missed, count.late
-        return row
+class TopicRow:
+    """Makes the row of one topic, again and again: where its counts are is found out only once."""
 
-    def _subscribers(self, view: TopicView) -> tuple[list[SubscriberFigures], bool]:
-        """Return the rows of subscribers, and whether the counters of any are known."""
-        rows, known = [], False
-        for each in view.subscribers:
-            row = SubscriberFigures(each.module, each.node, each.link)
-            counters = self._sources.counters.get(each.module)
-            count = None if counters is None else counters.subscriber(each.module, each.node, view.name)
-            if count is not None:
-                row.waiting, row.lost, known = count.waiting, count.lost, True
-            rows.append(row)
-        return rows, known
+    __slots__ = (
+        "_all_counted",
+        "_counted",
+        "_is_of_service",
+        "_publishers",
+        "_sources",
+        "_subscribers",
+        "_view",
+        "row",
+    )
 
-    def _enter_rate(
-        self,
-        figures: TopicFigures,
-        view: TopicView,
-        counted: Mapping[tuple[str, str], PublisherFigures | None],
-        measured: MeasuredTopic | None,
+    def __init__(
+        self, view: TopicView, sources: FigureSources, row: TopicFigures | None, *, is_of_service: bool
     ) -> None:
+        """`row` is the last one that was made of the topic, if any was."""
+        self.row = row
+        self._view = view
+        self._sources = sources
+        self._is_of_service = is_of_service
+        self._publishers = [(each, _class_name(each), self._publisher_count(each)) for each in view.publishers]
+        self._subscribers = [(each, self._subscriber_count(each)) for each in view.subscribers]
+        # One of each node, however many links it is seen on; and firmware, which does not say which node it is.
+        counts = {(each.module, each.node): count for each, _, count in self._publishers}
+        self._counted = [count for count in counts.values() if count is not None]
+        is_anonymous = not {each.link for each in view.publishers}.issuperset(view.published_on)
+        self._all_counted = len(self._counted) == len(counts) > 0 and not is_anonymous
+
+    def _publisher_count(self, endpoint: Endpoint) -> PublisherCount | None:
+        counters = self._sources.counters.get(endpoint.module)
+        return None if counters is None else counters.publisher(endpoint.module, endpoint.node, self._view.name)
+
+    def _subscriber_count(self, endpoint: Endpoint) -> SubscriberCount | None:
+        counters = self._sources.counters.get(endpoint.module)
+        return None if counters is None else counters.subscriber(endpoint.module, endpoint.node, self._view.name)
+
+    def update(self, type_name: str | None) -> TopicFigures:
+        """Return the figures of now; if they are equal to the last ones, these."""
+        row = self._make(type_name)
+        if self.row is None or self.row != row:
+            self.row = row
+        return self.row
+
+    def _make(self, type_name: str | None) -> TopicFigures:
+        view, sources, name = self._view, self._sources, self._view.name
+        figures = TopicFigures(
+            name,
+            type_name,
+            view.size or None,
+            view.varies,
+            view.mismatch,
+            None if view.age is None else view.age // _AGE_STEP * _AGE_STEP,
+            [_publisher(*each) for each in self._publishers],
+            [_subscriber(*each) for each in self._subscribers],
+            laxity=sources.laxity.get(name),
+            is_of_service=self._is_of_service,
+        )
+        if self._counted:
+            figures.missed = clamp(sum([each.missed for each in self._counted]))
+            figures.late = clamp(sum([each.late for each in self._counted]))
+        if self._counted or any(count is not None for _, count in self._subscribers):
+            figures.lost_on_way = sources.lost.get(name, 0)
+        measured = sources.measured.get(name)
+        if measured is not None:
+            _enter_measured(figures, measured)
+        self._enter_rate(figures, measured)
+        return figures
+
+    def _enter_rate(self, figures: TopicFigures, measured: MeasuredTopic | None) -> None:
         """Enter the rate, by the best of its sources, and the bandwidth."""
-        rates = [None if each is None else each.rate for each in counted.values()]
-        known = [rate for rate in rates if rate is not None]
-        if rates and len(known) == len(rates):
-            figures.rate, figures.rate_source = sum(known), "counters"
-        elif (rate := self._rate_on_bus(view)) is not None:
+        view = self._view
+        rates = [each.rate for each in self._counted if each.rate is not None] if self._all_counted else []
+        if rates and len(rates) == len(self._counted):
+            figures.rate, figures.rate_source = sum(rates), "counters"
+        elif (rate := self._rate_on_bus()) is not None:
             figures.rate, figures.rate_source = rate, "bus"
         elif measured is not None and measured.rate is not None:
             figures.rate, figures.rate_source = measured.rate, "measured"
@@ -170,13 +198,31 @@ class TopicRows:
         elif measured is not None:
             figures.bandwidth = measured.bandwidth
 
-    def _rate_on_bus(self, view: TopicView) -> float | None:
-        frames = self._sources.buses.frames.get(view.name)
-        if frames is None or view.varies:
+    def _rate_on_bus(self) -> float | None:
+        frames = self._sources.buses.frames.get(self._view.name)
+        if frames is None or self._view.varies:
             return None
         with contextlib.suppress(MessageError):  # of unknown size, or too long for a bus
-            return frames / rtcan.fragment_count(view.size)
+            return frames / rtcan.fragment_count(self._view.size)
         return None
+
+
+def _class_name(endpoint: Endpoint) -> str | None:
+    return None if endpoint.publisher_class is None else CLASS_NAMES[endpoint.publisher_class]
+
+
+def _publisher(each: Endpoint, publisher_class: str | None, count: PublisherCount | None) -> PublisherFigures:
+    if count is None:
+        return PublisherFigures(each.module, each.node, each.link, publisher_class)
+    return PublisherFigures(
+        each.module, each.node, each.link, publisher_class, count.rate, count.sent, count.missed, count.late
+    )
+
+
+def _subscriber(each: Endpoint, count: SubscriberCount | None) -> SubscriberFigures:
+    if count is None:
+        return SubscriberFigures(each.module, each.node, each.link)
+    return SubscriberFigures(each.module, each.node, each.link, count.waiting, count.lost)
 
 
 def _enter_measured(figures: TopicFigures, measured: MeasuredTopic) -> None:
@@ -188,17 +234,14 @@ def _enter_measured(figures: TopicFigures, measured: MeasuredTopic) -> None:
         figures.lost_on_way = max(gaps, figures.lost_on_way or 0)
 
 
-def module_rows(
-    views: Iterable[ModuleView], topics: Mapping[str, TopicView], sources: FigureSources
-) -> list[ModuleFigures]:
+def module_rows(views: Iterable[ModuleView], topics: KnownTopics, sources: FigureSources) -> list[ModuleFigures]:
     """Return the figures of modules, each once, with their nodes."""
     best: dict[str, ModuleView] = {}
     for view in views:
         known = best.get(view.name)
         if known is None or _rank(view) < _rank(known):  # it may be seen on several links, and as a ROS node
             best[view.name] = view
-    nodes = _nodes_by_module(topics.values())
-    return [_module(view, sources.counters.get(name), nodes.get(name, {})) for name, view in best.items()]
+    return [_module(view, sources.counters.get(name), topics.nodes.get(name, {})) for name, view in best.items()]
 
 
 def _rank(view: ModuleView) -> tuple[bool, bool, float]:
@@ -220,13 +263,14 @@ def _nodes_by_module(topics: Iterable[TopicView]) -> dict[str, dict[str, NodeFig
     return modules
 
 
-def _module(view: ModuleView, counters: ModuleCounters | None, nodes: dict[str, NodeFigures]) -> ModuleFigures:
+def _module(view: ModuleView, counters: ModuleCounters | None, known: Mapping[str, NodeFigures]) -> ModuleFigures:
     row = ModuleFigures(view.name, view.state, view.kind, view.age, view.link, view.release, rebooted=view.rebooted)
+    nodes = dict(known)
     if counters is not None:
         row.answers, row.uptime, row.cpu = counters.answers, counters.uptime, counters.cpu
         for name, (running, restarts) in counters.nodes.items():
-            node = nodes.setdefault(name, NodeFigures(name))
-            node.running, node.restarts = running, restarts
+            node = nodes.get(name) or NodeFigures(name)
+            nodes[name] = NodeFigures(name, running, restarts, node.publishes, node.subscribes)
     row.nodes = [nodes[name] for name in sorted(nodes)]
     return row
 
@@ -236,24 +280,18 @@ def link_rows(counters: Mapping[str, ModuleCounters]) -> list[LinkFigures]:
     return [link for _, each in sorted(counters.items()) for link in each.links.values()]
 
 
-def service_rows(topics: Mapping[str, TopicView], sources: FigureSources, types: TopicRows) -> list[ServiceFigures]:
+def service_rows(topics: KnownTopics, sources: FigureSources, types: TypeNames) -> list[ServiceFigures]:
     """Return the figures of services: pairs of topics."""
-    rows = []
-    for name, responses in topics.items():
-        base = name.removesuffix(RESPONSES)
-        requests = topics.get(f"{base}{REQUESTS}")
-        if base != name and requests is not None:
-            rows.append(_service(base, requests, responses, sources, types))
-    return rows
+    return [_service(name, *pair, sources, types) for name, pair in topics.services.items()]
 
 
 def _service(
-    name: str, requests: TopicView, responses: TopicView, sources: FigureSources, types: TopicRows
+    name: str, requests: TopicView, responses: TopicView, sources: FigureSources, types: TypeNames
 ) -> ServiceFigures:
     servers = dict.fromkeys((each.module, each.node) for each in responses.publishers)
     row = ServiceFigures(
         name,
-        type=_service_type(types.type_name(requests), types.type_name(responses)),
+        type=_service_type(types.name(requests), types.name(responses)),
         servers=[f"{module or '?'}/{node}" for module, node in servers],
     )
     counters = ((module, node, sources.counters.get(module)) for module, node in servers)

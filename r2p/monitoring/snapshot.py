@@ -17,8 +17,8 @@ CLASS_NAMES = {
 """The classes of publishers in words."""
 
 
-class Figures(msgspec.Struct, omit_defaults=True):
-    """The base of all figures: JSON leaves out what is not known."""
+class Figures(msgspec.Struct, omit_defaults=True, gc=False):
+    """The base of all figures, which have parts, but never their whole: JSON leaves out what is not known."""
 
 
 class LatencyFigures(Figures):
