@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 import r2p
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES, WIRE_VERSION
 from r2p.messages import layout
-from r2p.modules.graph import Endpoint, ModuleView
+from r2p.modules.graph import Endpoint, ModuleView, TopicLooks
 from r2p.msg import Led
 from r2p.protocols.discovery.events import Mismatched, TopicType
 from tests.bench import hold, joined, local, settle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 NRT, SPORADIC = r2p.PublisherClass.NON_REAL_TIME, r2p.PublisherClass.SPORADIC
 LAB = "memory:lab"
@@ -68,6 +73,30 @@ async def test_what_a_link_tells() -> None:
             ("B", "log"): (["log"], []),
             ("B", "show"): ([], ["leds"]),
         }
+
+
+@pytest.mark.virtual_time
+async def test_looks_have_the_same_views_until_more_than_ages_changes() -> None:
+    async with joined("A") as a, joined("B") as b, r2p.Module("_tool1", via=LAB, observer=True) as tool:
+        looks = TopicLooks(tool.network, tool.space)
+        steps: list[Callable[[], object]] = [
+            lambda: a.start(hold, name="drive").advertise("leds", Led),
+            lambda: b.start(hold, name="show").subscribe("leds", Led),
+            lambda: tool.start(hold, name="look").subscribe("leds", Led, lossy=True),
+            lambda: a.start(hold, name="more").advertise("leds", Led),
+        ]
+        for step in steps:
+            before = looks.look()
+            step()
+            await settle(3.0)
+            views = looks.look()
+            assert views is not before
+            assert views == tool.network.topics()
+            await settle(10.0)
+            assert looks.look() is views
+            assert views == tool.network.topics()  # with the ages of now
+        tool.links[0].discovery.topics["leds"].mismatch = True
+        assert looks.look()["leds"].mismatch
 
 
 @pytest.mark.virtual_time

@@ -2,14 +2,17 @@
 
 import asyncio
 from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import pytest
 
 import r2p
 from r2p.codecs import rtcan
+from r2p.modules.graph import TopicView
 from r2p.monitoring.monitor import NetworkMonitor
 from r2p.monitoring.polling import can_be_asked
+from r2p.monitoring.rows import TopicRow
 from r2p.monitoring.snapshot import ModuleFigures, NetworkSnapshot, TopicFigures
 from r2p.msg import Led, String
 from r2p.testing.network import Network, node_in
@@ -226,6 +229,37 @@ async def test_rows_that_have_not_changed_are_the_same_objects_and_many_topics_a
             assert before.topics is not after.topics
             assert all(one is other for one, other in zip(before.topics, after.topics, strict=True))
             assert _module(before, "ARM") is not _module(after, "ARM")
+
+
+async def test_where_the_counts_of_topics_are_is_found_out_only_after_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[str] = []
+
+    class Counted(TopicRow):
+        def __init__(self, view: TopicView, *args: Any, **options: Any) -> None:
+            super().__init__(view, *args, **options)
+            found.append(view.name)
+
+    monkeypatch.setattr("r2p.monitoring.monitor.TopicRow", Counted)
+    network = Network()
+    async with network.node("ARM") as node, network.module("PC", observer=True) as pc, NetworkMonitor(pc) as monitor:
+        node.advertise("joint", Led, r2p.Periodic(0.01, Led))
+        sporadic = node.advertise("rare", Led)
+        await figures(monitor, lambda each: topics_with_rates(each) >= {"joint", "rare"})
+        found.clear()
+        before = monitor.snapshot
+        await asyncio.sleep(10.0)
+        assert topic(monitor.snapshot, "rare") is topic(before, "rare")
+        assert topic(monitor.snapshot, "joint") != topic(before, "joint")
+        await sporadic.publish(Led())
+        await figures(monitor, lambda each: topic(each, "rare").publishers[0].sent == 1)
+        assert not found
+        node.subscribe("joint", Led, lossy=True)
+        await figures(monitor, lambda each: any(row.waiting is not None for row in topic(each, "joint").subscribers))
+        assert {"joint", "rare"} <= set(found)
+
+
+def topics_with_rates(snapshot: NetworkSnapshot) -> set[str]:
+    return {each.name for each in snapshot.topics if each.rate is not None}
 
 
 async def test_names_that_no_topic_can_have_are_not_measured() -> None:
