@@ -7,6 +7,7 @@ of the caller (`MessageError`). Bytes that are not such a message raise `DecodeE
 - `management`: the messages of the topic `R2P`; `loader`: those of `BOOT_<module>`; both in terms of `_records`.
 - `attachment`, `liveliness`: what accompanies messages on zenoh, and the tokens there.
 - `services`: the header of requests and responses, and the texts of errors.
+- `nmea`: the sentences of GPS receivers.
 - `schemas`: answers to requests for a type; `probes`: messages by which gateways find loops.
 """
 
