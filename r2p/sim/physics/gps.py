@@ -44,7 +44,7 @@ class GpsSpec(msgspec.Struct, frozen=True, kw_only=True):
     satellites: int = 9
 
 
-class Origin(msgspec.Struct, frozen=True):
+class GeoOrigin(msgspec.Struct, frozen=True):
     """Where the world's origin is on Earth: x points north there, and y west."""
 
     latitude: float = 45.478
@@ -89,7 +89,7 @@ class GpsReceiver:
     ) -> None:
         """`now` returns UTC in ns."""
         self.spec = spec
-        self.origin = Origin()
+        self.origin = GeoOrigin()
         self.has_sky = True
         """False: it sees no satellite, and sends sentences without a fix."""
         self.connected = True

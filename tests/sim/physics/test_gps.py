@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from r2p.codecs.nmea import Gga, NmeaReader, Rmc, Sentence, Vtg
-from r2p.sim.physics.gps import GpsReceiver, GpsSpec, GpsTruth, Origin
+from r2p.sim.physics.gps import GeoOrigin, GpsReceiver, GpsSpec, GpsTruth
 from r2p.units import SECOND
 
 START = 1_356_998_400 * SECOND  # 2013-01-01
@@ -105,8 +105,8 @@ def test_sentences_have_the_position_in_degrees() -> None:
     assert fix.latitude is not None
     assert fix.longitude is not None
     assert sky.receiver.origin.local(fix.latitude, fix.longitude) == pytest.approx((100.0, -50.0), abs=0.02)
-    assert fix.latitude > Origin().latitude
-    assert fix.longitude > Origin().longitude  # y is west, so -50 m is east
+    assert fix.latitude > GeoOrigin().latitude
+    assert fix.longitude > GeoOrigin().longitude  # y is west, so -50 m is east
     assert isinstance(course, Vtg)
     assert course.course == pytest.approx(90.0)
     assert course.speed == pytest.approx(2.0, abs=1e-3)
@@ -114,7 +114,7 @@ def test_sentences_have_the_position_in_degrees() -> None:
 
 def test_a_degree_is_as_long_as_on_wgs_84() -> None:
     """At 45 degrees: 111 132 m to the north and 78 847 m to the east, as in tables."""
-    origin = Origin(latitude=45.0, longitude=0.0)
+    origin = GeoOrigin(latitude=45.0, longitude=0.0)
     assert origin.local(46.0, 1.0) == pytest.approx((111_132, -78_847), abs=1)
 
 
