@@ -80,6 +80,7 @@ from r2p.parameters.parameter import Parameter
 from r2p.parameters.registry import ModuleParameters
 from r2p.protocols.discovery.events import Command, Mismatched, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
 from r2p.runtime.events import LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
+from r2p.runtime.network_time import NetworkTick, Sync
 from r2p.runtime.node import Node
 from r2p.runtime.publishers import PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runtime.qos import Missed, NonRealTime, Periodic, Sporadic
@@ -136,6 +137,7 @@ __all__ = [
     "ModuleView",
     "NameConflict",
     "NameTooLong",
+    "NetworkTick",
     "NetworkView",
     "NoServer",
     "Node",
@@ -174,6 +176,7 @@ __all__ = [
     "SubscriberStatistics",
     "SwapLimits",
     "SwapResult",
+    "Sync",
     "Tick",
     "Timestamp",
     "TooLong",

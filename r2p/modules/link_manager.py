@@ -204,6 +204,8 @@ class LinkManager:
         for topic in list(self.space.topics.values()):
             link.stats.lost.guard(link.topic_changed, topic)
         link.set_flags(self.flags)
+        for added in list(self.space.on_link_added):
+            added()
 
     def detach(self, link: Link) -> None:
         """Remove a link that is closed for good, and keep its counters."""

@@ -7,25 +7,26 @@ closed when its function ends, for any reason.
 import asyncio
 import enum
 from collections.abc import AsyncIterator, Callable, Mapping
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeVar, overload
 
-from r2p.clock import SHORTEST, Ticker, check_seconds, check_timeout
-from r2p.errors import Closed, Error, InvalidName, TransportError
+from r2p.clock import SHORTEST, check_seconds, check_timeout
+from r2p.errors import Closed, Error, InvalidName, MessageError
 from r2p.log_lines import NodeLogger, node_logger
-from r2p.messages import Layout, Message, layout
+from r2p.messages import Message, layout
 from r2p.names import RESERVED, topic_name
 from r2p.parameters.definition import Check, define_parameter
 from r2p.parameters.parameter import Parameter
 from r2p.parameters.registry import ModuleParameters
 from r2p.runtime.accepting import Accept, AcceptedTypes
 from r2p.runtime.events import EventHub, ModuleEvent
+from r2p.runtime.network_time import NetworkTick, Sync, SyncHook, network_ticks
 from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runtime.publishers.held import ReplacedNode, hold
 from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
 from r2p.runtime.queues import QUEUE_BYTES, checkpoint
 from r2p.runtime.spin_reminder import SpinReminder
 from r2p.runtime.subscriber import Callback, Keep, Subscriber, SubscriberOptions
-from r2p.runtime.ticks import Tick, ticks
+from r2p.runtime.ticks import Closable, Tick, ticks
 from r2p.runtime.topic import TopicSpace
 from r2p.services.client import ServiceClient
 from r2p.services.definition import Definition, Q, R, ServiceType, define
@@ -101,7 +102,8 @@ class Node:
         self._remap = remap or {}
         self._events = events or EventHub()
         self._parameters = ModuleParameters(space.module) if parameters is None else parameters
-        self._tickers: set[Ticker] = set()
+        self._tickers: set[Closable] = set()
+        self._sync_hooks: list[SyncHook] = []
         self._reminder: SpinReminder | None = None
         """A reminder from the first subscription with a callback until `spin` is called."""
         self._spinning: asyncio.Future[None] | None = None
@@ -145,7 +147,11 @@ class Node:
         shape = layout(type)
         name = self.resolve(topic)
         check_class(name, klass)
-        self._check_links(name, shape, klass, strict=strict)
+        if strict:
+            period = klass.period if isinstance(klass, Periodic) else None
+            self._space.check_links(name, shape, klass.publisher_class, period)
+        else:
+            self._space.warn_of_links(self.log, name, shape, "is not sent on")
         where = self._space.open(name, shape)
         publisher: Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]
         try:
@@ -241,7 +247,7 @@ class Node:
         accepted = AcceptedTypes(name, shape, accept) if accept else None
         where = self._space.open(name, shape) if accepted is None else self._space.open_accepting(name, accepted)
         if shape is not None:
-            self._warn_of_links(where.name, shape, "can't be received on")
+            self._space.warn_of_links(self.log, where.name, shape, "can't be received on")
         subscriber: Subscriber[Any] = Subscriber(self._space, self, where, shape, options, accepted)
         self.subscribers[subscriber] = None
         subscriber.open()
@@ -396,14 +402,41 @@ class Node:
         await checkpoint()
         return True
 
-    def every(self, period: float) -> AsyncIterator[Tick]:
+    @overload
+    def every(self, period: float, *, clock: Literal["local"] = ...) -> AsyncIterator[Tick]: ...
+
+    @overload
+    def every(self, period: float, *, clock: Literal["network"]) -> AsyncIterator[NetworkTick]: ...
+
+    def every(self, period: float, *, clock: str = "local") -> AsyncIterator[Tick] | AsyncIterator[NetworkTick]:
         """Iterate over ticks, one each `period` seconds on absolute phase, the first after one period.
 
+        With `clock="network"` ticks are due at whole multiples of the period in the time that the module's first RTCAN
+        bus shares, so at the same instants on all its modules. The first one waits until that time is known. In a
+        module without RTCAN, ticks are due at whole multiples in UTC.
+
         A loop body that takes longer than a period skips ticks, which `Tick.skipped` counts. Raises MessageError, at
-        once, for a period that is not a number of seconds, 1e-6 or more.
+        once, for a period that is not a number of seconds, 1e-6 or more, and for another clock.
         """
         check_seconds("the period of every()", period, least=SHORTEST)
+        if clock == "network":
+            return network_ticks(period, self._space, self._tickers, self.log)
+        if clock != "local":
+            raise MessageError(f"the clock of every() is 'local' or 'network', not {clock!r}")
         return ticks(period, self._space.loop, self._space.clock, self._tickers)
+
+    def on_sync(self, callback: Callable[[Sync], object]) -> None:
+        """Call `callback(sync)` at each sync of the module's first RTCAN bus, at the same instant on all its modules.
+
+        It is called in the interrupt, so to speak: at once when the frame is received, or was sent by this module.
+        Latch a value there, and handle it elsewhere. Calls end with the node; what the callback raises is its crash.
+
+        Raises TransportError if no link of the module has RTCAN, Error for a coroutine function, and Closed once the
+        node has ended.
+        """
+        if self.closed:
+            raise Closed(f"node {self.name} has ended: it can't wait for syncs any more")
+        self._sync_hooks.append(SyncHook(self._space, self, callback))
 
     def now(self) -> int:
         """Return UTC in ns since 1970, which never jumps back."""
@@ -477,7 +510,7 @@ class Node:
         self.closed = self._ending = True
         self._forget_reminder()
         self._parameters.node_closed(self)
-        for each in (*self.services, *self.publishers, *self.subscribers, *self._tickers):
+        for each in (*self.services, *self.publishers, *self.subscribers, *self._tickers, *self._sync_hooks):
             each.close()
         if self._started:
             self._started = False
@@ -516,7 +549,7 @@ class Node:
             (definition.request_topic, definition.requests),
             (definition.response_topic, definition.responses),
         ):
-            self._warn_of_links(topic, shape, "is not sent on")
+            self._space.warn_of_links(self.log, topic, shape, "is not sent on")
 
     def resolve(self, topic: str) -> str:
         """Return the name of a topic or service after remapping. Raises InvalidName or NameTooLong, and Closed."""
@@ -527,34 +560,6 @@ class Node:
         if name in RESERVED:
             raise InvalidName(f"topic {name} is reserved for messages of r2p itself: choose another name")
         return name
-
-    def _check_links(
-        self, topic: str, shape: Layout[Any], klass: NonRealTime | Sporadic | Periodic[Any], *, strict: bool
-    ) -> None:
-        """Warn of links that can't send the topic; `strict`: raise TransportError for links that give less."""
-        if not strict:
-            self._warn_of_links(topic, shape, "is not sent on")
-            return
-        size, varies = shape.size, shape.varies
-        for link in self._space.links:
-            reason = link.refusal(size, varies=varies)
-            if not reason and link.best_effort(klass.publisher_class):
-                reason = link.guarantee(topic, klass.publisher_class)
-            elif not reason and isinstance(klass, Periodic):
-                reason = link.inadmissible(size, klass.period, varies=varies)
-            if reason:
-                raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")
-
-    def _warn_of_links(self, topic: str, shape: Layout[Any], what: str) -> None:
-        """Warn of links that can't carry the topic, or not all of its messages. `what` is the predicate."""
-        for link in self._space.links:
-            if (reason := link.refusal(shape.size, varies=shape.varies)) is None:
-                continue
-            if shape.varies:
-                text = "topic %s: link %s can't carry its longest messages (%s); they are counted as too long"
-                self.log.warning(text, topic, link.name, reason)
-            else:
-                self.log.warning("topic %s %s link %s: %s", topic, what, link.name, reason)
 
     async def _serve(self) -> bool:
         served = False
@@ -573,7 +578,8 @@ class Node:
     async def _arrival(self) -> None:
         """Wait for a message of a subscription with a callback, or for one more of these."""
         subscribers = self._with_callback()
-        works = self.services or any(isinstance(each, PeriodicPublisher) for each in self.publishers)
+        periodics = any(isinstance(each, PeriodicPublisher) for each in self.publishers)
+        works = self.services or self._sync_hooks or periodics
         if not subscribers and not works:
             raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")
         waiter = self._spinning = self._space.loop.create_future()

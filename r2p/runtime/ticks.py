@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from r2p.clock import Clock, Ticker
 from r2p.units import SECOND
@@ -16,8 +16,15 @@ class Tick(NamedTuple):
     skipped: int
 
 
+class Closable(Protocol):
+    """A ticker, of which a node only wants that it ends with it."""
+
+    def close(self) -> None:
+        """Stop the ticks."""
+
+
 async def ticks(
-    period: float, loop: asyncio.AbstractEventLoop, clock: Clock, tickers: set[Ticker]
+    period: float, loop: asyncio.AbstractEventLoop, clock: Clock, tickers: set[Closable]
 ) -> AsyncIterator[Tick]:
     """Yield a tick each `period` seconds, the first after one period. The ticker is in `tickers` while it runs."""
     waiter: asyncio.Future[None] | None = None

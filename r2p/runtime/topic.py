@@ -12,12 +12,14 @@ from weakref import WeakValueDictionary
 
 from r2p.clock import Clock
 from r2p.codecs.management import ANY_TYPE
-from r2p.errors import TypeMismatch
+from r2p.errors import TransportError, TypeMismatch
+from r2p.log_lines import NodeLogger
 from r2p.messages import Layout
 from r2p.protocols.discovery.events import TopicType
 from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.accepting import AcceptedTypes
 from r2p.runtime.backpressure import Sink, WaitQueue
+from r2p.runtime.network_time import NetworkClock
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue, WakeScheduler
 from r2p.runtime.sample import LastReceived, PublisherClass, Sample, Source
 
@@ -324,6 +326,9 @@ class LinkView(Protocol):
     def network_time(self) -> int | None:
         """Return the time (ns) that all nodes of the link's network share; None without one, or if it is unknown."""
 
+    def network_clock(self) -> NetworkClock | None:
+        """Return the clock of that time, with which nodes tick; None without one."""
+
     def fingerprint_of(self, topic: str, source: Source) -> bytes:
         """Return the fingerprint of the type in which this source publishes the topic; ANY_TYPE if it is unknown."""
 
@@ -358,6 +363,8 @@ class TopicSpace:
         self.wake_scheduler = WakeScheduler(loop)
         self.topics: dict[str, Topic] = {}
         self.links: list[LinkView] = []
+        self.on_link_added: list[Callable[[], object]] = []
+        """Callbacks after a link was added."""
         self.make_topic: Callable[[str, WakeScheduler], Topic] = Topic
         """The class of the topics; a gateway has its own."""
         self.signal_listeners: list[Callable[[PublisherSignal], object]] = []
@@ -397,6 +404,35 @@ class TopicSpace:
                 f"topic {name} is {layout.cls.__name__} ({layout.schema}) in module {self.module}, which a subscriber "
                 f"of {accepted.names} does not accept: add it to its accept="
             )
+
+    def network_clock(self) -> NetworkClock | None:
+        """Return the clock of the first link that has one: the time of the module's RTCAN network."""
+        return next((clock for link in self.links if (clock := link.network_clock()) is not None), None)
+
+    def check_links(
+        self, topic: str, shape: Layout[Any], publisher_class: PublisherClass, period: float | None
+    ) -> None:
+        """Raise TransportError for a link that gives less than the class of a publisher asks for."""
+        size, varies = shape.size, shape.varies
+        for link in self.links:
+            reason = link.refusal(size, varies=varies)
+            if not reason and link.best_effort(publisher_class):
+                reason = link.guarantee(topic, publisher_class)
+            elif not reason and period is not None:
+                reason = link.inadmissible(size, period, varies=varies)
+            if reason:
+                raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")
+
+    def warn_of_links(self, log: NodeLogger, topic: str, shape: Layout[Any], what: str) -> None:
+        """Warn of links that can't carry the topic, or not all of its messages. `what` is the predicate."""
+        for link in self.links:
+            if (reason := link.refusal(shape.size, varies=shape.varies)) is None:
+                continue
+            if shape.varies:
+                text = "topic %s: link %s can't carry its longest messages (%s); they are counted as too long"
+                log.warning(text, topic, link.name, reason)
+            else:
+                log.warning("topic %s %s link %s: %s", topic, what, link.name, reason)
 
     def fingerprint_of(self, topic: Topic, source: Source) -> bytes:
         """Return the fingerprint of the type in which another module publishes a topic; ANY_TYPE if it is unknown."""

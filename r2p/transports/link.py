@@ -38,6 +38,7 @@ from r2p.protocols.discovery.events import (
 from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
 from r2p.protocols.keys import LinkEnd
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
+from r2p.runtime.network_time import NetworkClock
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic
 from r2p.transports.announcement import (
@@ -357,6 +358,10 @@ class Link(abc.ABC):
 
     def network_time(self) -> int | None:
         """Return the time (ns) that all nodes of the network share; None without one, or if it is unknown."""
+        return None
+
+    def network_clock(self) -> NetworkClock | None:
+        """Return the clock of that time, with which nodes tick; None without one."""
         return None
 
     def translation(self) -> ClockOffset | None:

@@ -235,8 +235,10 @@ class Cycle:
         """Return when the master's next cycle begins."""
         return self._grid + self.timing.cycle - min(self._behind, self._slot // _CATCH_UP)
 
-    def on_sync_sent(self, frame: Frame, at: int) -> None:
+    def on_sync_sent(self, frame: Frame, at: int) -> bool:
         """Correct the reference if the master's sync, on the bus until `at`, left late: its slaves are late with it.
+
+        Return False for the sync of an earlier cycle.
 
         Delays within the jitter of latencies change nothing: the plan is as good a guess as the stamp, and keeps the
         slots of the next cycle exactly one cycle later.
@@ -245,6 +247,7 @@ class Cycle:
         ours = rtcan.message_of(frame.id) == self.counter & CYCLE_MASK  # it may be confirmed in the next cycle
         if ours and _IN_TIME < start - self._grid <= self._slot:
             self.reference = start
+        return ours
 
     def _start(self, start: int, low: int, mask: int) -> Alignment:
         cycles, off = self._distance(start)

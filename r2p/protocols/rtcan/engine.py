@@ -128,6 +128,10 @@ class Engine:
             self.network.utc_offset = utc - time
             self.network.utc_error = min(-(-error // 1000), management.NO_UTC - 1)
 
+    def report_syncs(self, wanted: bool) -> None:
+        """Return a `SyncSeen` for each sync from now on, or no longer."""
+        self._context.report_syncs = wanted
+
     def filters(self) -> list[tuple[int, int]]:
         """Return the frames to receive: those with `id & mask == identifier` for one of these (identifier, mask)."""
         if not self.ready:

@@ -168,6 +168,19 @@ class ParametersMatch(msgspec.Struct, frozen=True):
     """The network's parameters are this node's after all."""
 
 
+class SyncSeen(msgspec.Struct, frozen=True):
+    """The sync of cycle `counter` was received, or was sent by this node. Only while `EngineContext.report_syncs`.
+
+    `start` is the beginning of the cycle, `end` the end of the frame, both by the node's clock; `length` the frame's
+    exact length, the same for all nodes (ns). `end` 0: this node is the master, and no other node has seen its sync.
+    """
+
+    counter: int
+    start: int
+    end: int
+    length: int
+
+
 class SlotsGranted(msgspec.Struct, frozen=True):
     """A periodic message owns slots. `period`, `phase` in slots; `interval` is the true period in ns."""
 
@@ -192,7 +205,7 @@ class SlotsLost(msgspec.Struct, frozen=True):
 
 
 PortAction = Transmit | Withdraw
-NetworkEvent = Ready | IdConflict | NewMaster | LostSync | ParameterMismatch | ParametersMatch
+NetworkEvent = Ready | IdConflict | NewMaster | LostSync | ParameterMismatch | ParametersMatch | SyncSeen
 SlotEvent = SlotsGranted | SlotsRefused | SlotsLost
 Action = PortAction | Received | Done | Due | NetworkEvent | SlotEvent
 
@@ -211,12 +224,20 @@ class EngineContext:
         self.actions: list[Action] = []
         """Actions for the owner of the engine, in order."""
         self.counts: Counter[str] = Counter()
+        self.report_syncs = False
+        """True while the owner wants a `SyncSeen` for each sync."""
         self._draws = 0
 
     def draw(self, below: int) -> int:
         """Return a random number below this one. All derive from `settings.number`, so that a run can be repeated."""
         self._draws += 1
         return _mix(self.settings.number + self._draws) % below
+
+    def report_sync(self, frame: Frame, end: int) -> None:
+        """Report this cycle's sync, on the bus until `end` (0: it was not), before anything else that it causes."""
+        cycle = self.cycle
+        length = end - start_of_frame(frame, end, self.timing.bit)
+        self.actions.insert(0, SyncSeen(cycle.counter, cycle.reference, end, length))
 
     def report(self, handle: Hashable, fate: Fate, *, missed: bool, at: int) -> None:
         """Report a message that was sent or given up, if it has a handle; count a missed one."""

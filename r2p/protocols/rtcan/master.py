@@ -166,6 +166,8 @@ class MasterRole:
             if self._inherits and not self._cycle.delay(max(0, start - first.start)):
                 self._set_inherits(False)
             self._lead(now, start, first.counter, decode_sync(first.frame).mask)
+            if self._context.report_syncs:
+                self._context.report_sync(first.frame, at)
         elif outcome is not Outcome.UNKNOWN and self._retries < _RETRIES:
             self._retries += 1
             self._retry(now)

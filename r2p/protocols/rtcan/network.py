@@ -36,6 +36,8 @@ _UNKNOWN_MASTER = 1_200_000_000  # ns; a master that sends no NETWORK for so lon
 _NEAR = 4  # cycles that a NETWORK may be late, or extrapolating from the last one be wrong
 _YIELDED = 3  # cycles after which a lesser master's syncs are over
 
+_NOT_OF_THIS_CYCLE = (Alignment.FOREIGN, Alignment.REPEATED)
+
 _TOO_LATE = (
     "this node was the master, and its computer was busy or stopped: "
     "give r2p a real-time priority (r2p doctor tells how), or let another node be the master (priority=)"
@@ -203,7 +205,8 @@ class NetworkMembership:
             return
         self._transmitter.poll(now)  # first the rest of the cycle that ends now
         bridged = self._cycle.state is CycleState.HOLDING
-        match self._cycle.on_sync(frame, stamp):
+        alignment = self._cycle.on_sync(frame, stamp)
+        match alignment:
             case Alignment.ALIGNED:
                 if bridged:
                     self._counts["missed syncs"] += 1
@@ -212,12 +215,14 @@ class NetworkMembership:
             case Alignment.FOREIGN:
                 self._counts["foreign syncs"] += 1
                 self._tracker.on_foreign()
-            case Alignment.STARTED | Alignment.RESUMED as alignment:
+            case Alignment.STARTED | Alignment.RESUMED:
                 self._join(now, resumed=alignment is Alignment.RESUMED)
             case _:
                 self._transmitter.realign(now)
         if not self.verified:
             self._verify_by_length(now)
+        if self._context.report_syncs and alignment not in _NOT_OF_THIS_CYCLE:
+            self._report_sync(frame, stamp)
 
     def on_network(self, now: int, network: management.Network) -> None:
         """Follow the NETWORK of a master, yield to it, or answer it."""
@@ -347,6 +352,11 @@ class NetworkMembership:
             if changed:
                 self._actions.append(NewMaster(network.id8, network.epoch, own=False))
             self._requests.resume(now)
+
+    def _report_sync(self, frame: Frame, stamp: int) -> None:
+        """Report a sync that was received, once it is known whose it is."""
+        if self.verified and self._cycle.anchored:
+            self._context.report_sync(frame, stamp - self._context.settings.receive_latency)
 
     def _verify_by_length(self, now: int) -> None:
         """Accept a master without NETWORK if its cycle is as long as this node's."""

@@ -193,6 +193,7 @@ class SlotTransmitter:
         self.mailboxes = Mailboxes(context, self.queue)
         self._next_cycle = next_cycle
         self._cycle = cycle
+        self._context = context
         self._slots, self._slot, self._bit = cycle.timing.slots, cycle.timing.slot, cycle.timing.bit
         self._actions = context.actions
         self._counts = context.counts
@@ -322,17 +323,24 @@ class SlotTransmitter:
         elif isinstance(item, PeriodicMessage):
             self._confirm_periodic(now, item, outcome, at)
         elif item is _SYNC:
-            if outcome is not _SENT:
-                self._counts["syncs not sent"] += 1
-            elif self._cycle.state is _LEADING:
-                self._cycle.on_sync_sent(self._sync, at)
-                self._schedule(now)
+            self._confirm_sync(now, outcome, at)
         elif isinstance(item, FirstSync):
             item.done(now, outcome, at)
         elif item is _DISCARDED:
             self.reschedule(now)
         else:
             self._counts["confirmed without need"] += 1
+
+    def _confirm_sync(self, now: int, outcome: Outcome, at: int) -> None:
+        sent = outcome is _SENT
+        if not sent:
+            self._counts["syncs not sent"] += 1
+        if self._cycle.state is _LEADING:
+            of_this_cycle = self._cycle.on_sync_sent(self._sync, at) if sent else True
+            if self._context.report_syncs and of_this_cycle:
+                self._context.report_sync(self._sync, at if sent else 0)
+            if sent:
+                self._schedule(now)
 
     # Slots
 

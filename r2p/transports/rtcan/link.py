@@ -5,6 +5,7 @@ the node has an id8, and everything is announced again when it gets another one.
 16-bit message id, which its SUBSCRIBE_RESPONSE announces (see `message_ids`).
 """
 
+import functools
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, ClassVar
@@ -34,6 +35,7 @@ from r2p.protocols.rtcan.events import (
     Ready,
     Received,
     SlotEvent,
+    SyncSeen,
 )
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
@@ -44,6 +46,7 @@ from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, unique_name
 from r2p.transports.rtcan.driver import EngineDriver, UtcEstimator
 from r2p.transports.rtcan.message_ids import FIRMWARE, R2P, MessageIdMap, address_of, publisher_in
+from r2p.transports.rtcan.network_clock import RtcanClock
 from r2p.transports.rtcan.tx import (
     ResponseHandle,
     SampleHandle,
@@ -115,6 +118,7 @@ class RtcanLink(BufferedLink):
         """Get what is on the bus, once a second. While there are any, the port receives all frames."""
         self._utc_error = utc_error
         self._utc = UtcEstimator(self.driver)
+        self._network_clock: RtcanClock | None = None  # from its first use on
         self._utc_offset = 0  # of UTC from the monotonic clock (ns)
         self._utc_offset_until = LONG_AGO
         self._topic_ids = TopicIdAllocator(discovery.alias)
@@ -137,6 +141,9 @@ class RtcanLink(BufferedLink):
             self._done(action)
         elif isinstance(action, Due):
             self._slotted.fill(action)
+        elif isinstance(action, SyncSeen):
+            if self._network_clock is not None:
+                self._network_clock.on_sync(action)
         elif isinstance(action, SlotEvent):
             self._slotted.slots_changed(action)
             self._slotted.wake_waiters()
@@ -167,6 +174,8 @@ class RtcanLink(BufferedLink):
     def _network_event(self, event: Action) -> None:
         match event:
             case Ready():
+                if event.profile is Profile.FIRMWARE and self._network_clock is not None:
+                    self._network_clock.close()
                 self._limit_discovery(event.profile)
                 self.driver.update_filters()  # before it announces: answers come to the new id8
                 self._announce()
@@ -393,6 +402,14 @@ class RtcanLink(BufferedLink):
     def network_time(self) -> int | None:
         return self.engine.network_time(self.driver.now())
 
+    def network_clock(self) -> RtcanClock | None:
+        if self._closed or self.engine.profile is Profile.FIRMWARE:
+            return None
+        if self._network_clock is None or self._network_clock.closed:
+            notice = functools.partial(self._hub.link_notice, self)
+            self._network_clock = RtcanClock(self.name, self.driver, notice)
+        return self._network_clock
+
     def translation(self) -> ClockOffset | None:
         return self._utc.offset(self.driver.now())
 
@@ -433,6 +450,8 @@ class RtcanLink(BufferedLink):
         if not self._closed:
             self._slotted.close()  # while the engine can still send that
             super().close()
+            if self._network_clock is not None:
+                self._network_clock.close()
             self._slotted.wake_waiters()
 
 
