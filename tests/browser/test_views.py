@@ -21,6 +21,11 @@ STORE = """tables => ({
     time: r2p.store.time,
     ...Object.fromEntries(tables.map(table => [table, [...r2p.store[table].values()]])),
 })"""
+IS_SEEN = """(() => {
+    const frame = document.getElementById("views").getBoundingClientRect()
+    const link = document.querySelector("#views [aria-current]").getBoundingClientRect()
+    return frame.left <= link.left && link.right <= frame.right && frame.top <= link.top && link.bottom <= frame.bottom
+})()"""
 VIEWS = "() => [...document.querySelectorAll('#views a')].map(each => each.dataset.view)"
 
 
@@ -55,5 +60,6 @@ async def test_each_view_can_be_used(browser: Browser, dash: Dash, size: str, sc
         for view in await tab.evaluate(VIEWS):
             await tab.evaluate("view => r2p.open(view)", view)
             await tab.until("document.querySelector('#views [aria-current]')?.dataset.view === argument", view)
+            await tab.until(IS_SEEN)
             found[view] = await looks.problems(tab)
         assert {view: problems for view, problems in found.items() if problems} == {}

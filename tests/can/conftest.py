@@ -15,6 +15,7 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(replay.Writer(config))
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Give all of them to one worker of pytest-xdist, as there is one kernel."""
     for item in items:

@@ -51,7 +51,8 @@ export class Shell {
       if (link.dataset.view === view.id) link.setAttribute("aria-current", "page")
       else link.removeAttribute("aria-current")
     }
-    by("views").querySelector("[aria-current]")?.scrollIntoView({ block: "nearest", inline: "nearest" })
+    const current = by("views").querySelector("[aria-current]")
+    if (current) reveal(by("views"), current)
     this.#entitle()
   }
 
@@ -193,6 +194,16 @@ export class Shell {
       ].flat(),
     })
   }
+}
+
+// Scroll a list until all of an element is seen. After scrollIntoView(), Tab would go on from that element in newer
+// browsers, and no longer begin at the top of the page.
+function reveal(list, element) {
+  const frame = list.getBoundingClientRect(), { left, right, top, bottom } = element.getBoundingClientRect()
+  list.scrollBy(
+    Math.floor(Math.min(0, left - frame.left)) || Math.ceil(Math.max(0, right - frame.right)),
+    Math.floor(Math.min(0, top - frame.top)) || Math.ceil(Math.max(0, bottom - frame.bottom)),
+  )
 }
 
 function isTyping(element) {
