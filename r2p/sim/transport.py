@@ -7,10 +7,15 @@
 
 Under virtual time everything is exact to the nanosecond, and the same seed gives the same run. On an ordinary loop the
 bus is paced to real time: its events run a little late, with their true instants.
+
+`can.Bus(interface="r2psim", channel="lab")` is a node on the same bus. If it was there first, outside of an event loop,
+the bus is in a thread of its own, and modules connect to it through python-can.
 """
 
 import asyncio
+import threading
 import weakref
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +28,10 @@ from r2p.errors import TransportError
 from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, Latency
 from r2p.sim.can.controller import ignore
+from r2p.sim.clocks import VirtualClock
+from r2p.sim.loop import VirtualLoop
 from r2p.transports.can.port import CanPort, CanPortListener, PortAlarm
+from r2p.transports.can.pythoncan import PythonCanPort
 from r2p.transports.link import Hub, Transport
 from r2p.transports.rtcan.transport import OPTIONS, RtcanOptions, apply_options, run_link
 from r2p.transports.url import Url, duration
@@ -36,8 +44,22 @@ DEFAULTS = RtcanOptions(priority=1, utc=0.0)
 """The options of `sim:` URLs: every module can be elected master, and knows UTC."""
 
 
+class PluggedNode(ABC):
+    """A node that is plugged into a `SimCan`, with its controller."""
+
+    controller: CanController
+
+    @abstractmethod
+    def power_off(self) -> None:
+        """Cut the node's power, also in the middle of a frame; its software notices that it can't send."""
+
+    @abstractmethod
+    def power_on(self) -> None:
+        """Restore the node's power: it starts as new."""
+
+
 class SimCan:
-    """A simulated CAN bus for modules of the running event loop; `bus` is the wire itself, with statistics and faults.
+    """A simulated CAN bus for nodes of the running event loop; `bus` is the wire itself, with statistics and faults.
 
     `bitrate` in bit/s. `noise`: the share of frames with a bit error. `seed`: None takes it from the loop's random
     numbers.
@@ -47,38 +69,61 @@ class SimCan:
         loop = asyncio.get_running_loop()
         numbers = random_of(loop).getrandbits(32) if seed is None else seed
         self.bus = CanBus(loop, bitrate=bitrate, noise=noise, seed=numbers)
+        self.loop = loop
+        clock = self.bus.timeline.clock
+        self._epoch = clock.now() - clock.monotonic()  # once: so differences of stamps are exact
         self.powered = True
         """True if modules that connect have power."""
-        self._ports: dict[str, SimPort] = {}
+        self.hosted = False
+        """True if the bus has an event loop of its own, in a thread: programs use it by `r2p.sim.buses.attach`."""
+        self._nodes: dict[str, PluggedNode] = {}
         self._unplugged: dict[str, CanController] = {}
 
     def transport(self, options: RtcanOptions = DEFAULTS, **node: Any) -> "SimTransport":
         """Return a transport on this bus for the `via=` of one module; `node` are fields of `CanNode`."""
         return SimTransport("", options, node, shared=self)
 
-    def port(self, module: str) -> "SimPort":
-        """Return the port of an open module. Raises KeyError if it is not on this bus."""
-        return self._ports[module]
+    @property
+    def bitrate(self) -> int:
+        """Bit/s."""
+        return SECOND // self.bus.bit
+
+    def utc(self, instant: int) -> int:
+        """Return an instant of the bus (ns) as ns since 1970."""
+        clock = self.bus.timeline.clock
+        return instant + (clock.epoch if isinstance(clock, VirtualClock) else self._epoch)
+
+    def port(self, name: str) -> PluggedNode:
+        """Return an open module's or program's node. Raises KeyError if it is not on this bus."""
+        return self._nodes[name]
 
     def power_off(self) -> None:
         """Cut the power of all modules, also of those that connect later."""
         self.powered = False
-        for port in list(self._ports.values()):
+        for port in list(self._nodes.values()):
             port.power_off()
 
     def power_on(self) -> None:
         """Restore the power of all modules."""
         self.powered = True
-        for port in list(self._ports.values()):
+        for port in list(self._nodes.values()):
             port.power_on()
 
-    def plug_in(self, port: "SimPort", node: CanNode) -> CanController:
-        """Connect a module. A module that was connected before gets its controller back, with its clock and numbers."""
+    def free_name(self, name: str) -> str:
+        """Return this name, followed by a number if a node has it already."""
+        number, free = 1, name
+        while free in self._nodes:
+            number += 1
+            free = f"{name} {number}"
+        return free
+
+    def plug_in(self, plugged: PluggedNode, node: CanNode) -> CanController:
+        """Connect a node. One that was connected before gets its controller back, with its clock and numbers."""
         name = node.name
-        while name in self._ports or (name in self._unplugged and self._unplugged[name].node != node):
+        while name in self._nodes or (name in self._unplugged and self._unplugged[name].node != node):
             name += "'"
             node = msgspec.structs.replace(node, name=name)
-        self._ports[name] = port
+        self._nodes[name] = plugged
         controller = self._unplugged.pop(name, None)
         if controller is None:
             return self.bus.attach(node)
@@ -86,14 +131,14 @@ class SimCan:
         return controller
 
     def unplug(self, controller: CanController) -> None:
-        """Disconnect the module of this controller, which has closed."""
+        """Disconnect the node of this controller, which has closed."""
         controller.power_off()
         controller.filters = ()
-        del self._ports[controller.name]
+        del self._nodes[controller.name]
         self._unplugged[controller.name] = controller
 
 
-class SimPort(CanPort):
+class SimPort(CanPort, PluggedNode):
     """A simulated controller as a port. Its clock is the node's, with its offset and drift."""
 
     now: Callable[[], int]
@@ -155,12 +200,10 @@ class SimPort(CanPort):
     # Faults
 
     def power_off(self) -> None:
-        """Cut the node's power, also in the middle of a frame; its software notices that it can't send."""
         self.controller.power_off()
         self._goes_down(_NO_POWER)
 
     def power_on(self) -> None:
-        """Restore the node's power: it starts as new."""
         self.controller.power_on()
 
     # From the controller
@@ -242,9 +285,13 @@ class SimTransport(Transport):
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         options = self._options
+        if self._shared is None and _hosted_bus(self._name) is not None:
+            attached = PythonCanPort("r2psim", self._name, options.bitrate)
+            await run_link(f"sim:{self._name}", hub, opened, attached, options)
+            return
         shared = self.can_bus()
-        if shared.bus.bit * options.bitrate != SECOND:
-            raise TransportError(f"sim:{self._name} has {SECOND // shared.bus.bit} bit/s, not {options.bitrate}")
+        if shared.bitrate != options.bitrate:
+            raise TransportError(f"sim:{self._name} has {shared.bitrate} bit/s, not {options.bitrate}")
         node = CanNode(hub.space.module, **{"one_shot": True} | self._node)
         port = SimPort(shared, node)
         try:
@@ -255,18 +302,46 @@ class SimTransport(Transport):
 
 _Buses = weakref.WeakValueDictionary[str, SimCan]
 _buses: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, _Buses] = weakref.WeakKeyDictionary()
+_buses_lock = threading.Lock()
 
 
 def can_bus(name: str, **options: Any) -> SimCan:
     """Return the running loop's simulated bus of that name, made at first use with these options of `SimCan`.
 
-    It lives as long as a module is on it, or the program holds a reference.
+    It lives as long as a module is on it, or the program holds a reference. Raises TransportError if it has been made
+    by `can.Bus` outside of this loop, in real time: then it is in a thread of its own.
     """
-    buses = _buses.setdefault(asyncio.get_running_loop(), weakref.WeakValueDictionary())
-    shared = buses.get(name)
-    if shared is None:
-        shared = buses[name] = SimCan(**options)
-    return shared
+    if _hosted_bus(name) is not None:
+        text = f"the bus {name} runs in a thread of its own, because can.Bus has made it outside of this event loop"
+        raise TransportError(f"{text}: use it by via='sim:{name}' and can.Bus, or make it here first")
+    with _buses_lock:
+        buses = _buses.setdefault(asyncio.get_running_loop(), weakref.WeakValueDictionary())
+        shared = buses.get(name)
+        if shared is None:
+            shared = buses[name] = SimCan(**options)
+        return shared
+
+
+def _hosted_bus(name: str) -> SimCan | None:
+    """Return the bus of this name that runs in a thread of its own, if it is not the running loop's thread."""
+    loop = asyncio.get_running_loop()
+    if not _in_real_time(loop):
+        return None
+    return next((bus for each, bus in running_buses() if each == name and bus.hosted and bus.loop is not loop), None)
+
+
+def running_buses() -> list[tuple[str, SimCan]]:
+    """Return the buses of all event loops of this process that run now in real time, or at a speed, with their names.
+
+    A bus of another thread's loop must be used in that thread only.
+    """
+    with _buses_lock:
+        found = [(name, shared) for buses in _buses.values() for name, shared in buses.items()]
+    return [(name, shared) for name, shared in found if shared.loop.is_running() and _in_real_time(shared.loop)]
+
+
+def _in_real_time(loop: asyncio.AbstractEventLoop) -> bool:
+    return not isinstance(loop, VirtualLoop) or loop.clock.paced
 
 
 def from_url(url: Url) -> SimTransport:

@@ -4,6 +4,7 @@
 process, `served` to one of another process. Neither knows python-can.
 """
 
+import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
@@ -43,11 +44,12 @@ class AttachmentOptions(msgspec.Struct, frozen=True, kw_only=True):
     (bit/s) is that of the bus that is made; if there is one already, its bit rate has to be this one. None: any.
 
     For the node, as in `CanNode`: `name` (followed by a number if it is in use), `one_shot`, `offset` (ns) and
-    `drift_ppm` of its clock, `loss`. `listen_only`: it sends nothing, no acknowledge either, so that the bus is as it
-    is without it.
+    `drift_ppm` of its clock, `loss`. `recovery`: it leaves bus-off by itself. `listen_only`: it sends nothing, no
+    acknowledge either, so that the bus is as it is without it.
 
-    For what is received: `own` frames too, when they have been sent; `errors`: error frames and changes of the
-    controller's state; `filters`: frames that pass one of them, or all if there is none; `rx_queue`: how many frames
+    For what is received: `own` frames too, when they have been sent; `states`: changes of the controller's state;
+    `errors`: each attempt to send that was destroyed, also those of other nodes (a node that is alone on a bus has one
+    after the other); `filters`: frames that pass one of them, or all if there is none; `rx_queue`: how many events
     wait, at most, and the oldest ones are dropped for newer ones.
 
     `served`: True takes a bus of another process only, False none of another process. None: whichever there is.
@@ -61,9 +63,11 @@ class AttachmentOptions(msgspec.Struct, frozen=True, kw_only=True):
     offset: int = 0
     drift_ppm: float = 0.0
     loss: float = 0.0
+    recovery: bool = False
     listen_only: bool = False
     own: bool = False
-    errors: bool = True
+    states: bool = True
+    errors: bool = False
     filters: tuple[BusFilter, ...] = ()
     rx_queue: int = RX_QUEUE
     served: bool | None = None
@@ -81,12 +85,13 @@ class AttachmentOptions(msgspec.Struct, frozen=True, kw_only=True):
 class BusFrame(msgspec.Struct, frozen=True, gc=False):
     """An event on the bus, as an attachment receives it.
 
-    With neither `error` nor `state`: a good `frame`; `own`, if this attachment has sent it. With `error`: an attempt to
-    send `frame` was destroyed, and `end` is the end of the error frame. With `state`: this controller's state is
-    another one; there is no frame.
+    With a `frame`: a good one; `own`, if this attachment has sent it. With `error`: an error frame, as this controller
+    sees it, `own` if it was sending; `place` is the number that SocketCAN has for the field of the frame in which the
+    error was (`FrameField`), 0 if it is not known. With `state`: this controller's state is another one.
 
-    `end` is the instant by the clock of this node (ns), `utc` the same since 1970: of one bus, differences of both are
-    exact. The error counters are this controller's; they count where there is an error or a state.
+    `end` is the end of the frame, or the detection of the error, by the clock of this node (ns), and `utc` the same
+    since 1970: of one bus, differences of both are exact. The error counters are this controller's; they count where
+    there is an error or a state.
     """
 
     frame: Frame | OtherFrame | None
@@ -94,6 +99,7 @@ class BusFrame(msgspec.Struct, frozen=True, gc=False):
     utc: int
     own: bool = False
     error: ErrorKind | None = None
+    place: int = 0
     state: ControllerState | None = None
     tx_errors: int = 0
     rx_errors: int = 0
@@ -151,7 +157,11 @@ class BusAttachment(ABC):
 
     @abstractmethod
     def restart(self) -> None:
-        """Leave bus-off now, with the error counters at 0. Nothing happens in another state."""
+        """Leave bus-off, after 128 times 11 recessive bits. Nothing happens in another state."""
+
+    def here(self) -> asyncio.AbstractEventLoop | None:
+        """Return the event loop that runs the bus, if it is that of this thread."""
+        return None
 
     @abstractmethod
     def fileno(self) -> int:

@@ -1,0 +1,184 @@
+"""A node on a simulated bus for a program outside of its event loop: a controller, and the queue of its driver.
+
+All methods run in the bus's loop. `local` uses it for programs of this process, `server` for those of other ones.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from r2p.codecs.can_bits import Frame, OtherFrame
+from r2p.sim.buses.attachment import AttachmentOptions, BusFilter, BusFrame
+from r2p.sim.can import CanController, CanNode, ControllerState, ErrorKind, FrameRecord
+from r2p.sim.can.controller import ignore
+from r2p.sim.transport import PluggedNode, SimCan
+
+
+class BusDriver(PluggedNode):
+    """Sends the frames of its `queue` in their order, one at a time, and hands events to `deliver`.
+
+    `on_room` is called after each frame that has left the queue. As with Linux's drivers, the controller has one
+    mailbox: so a program's frames keep their order, whatever their identifiers.
+    """
+
+    def __init__(
+        self,
+        shared: SimCan,
+        options: AttachmentOptions,
+        deliver: Callable[[BusFrame], object],
+        on_room: Callable[[], object] = ignore,
+    ) -> None:
+        self.shared = shared
+        self.queue: deque[Frame | OtherFrame] = deque()
+        """Frames to be sent; the first one stays here until it has been sent. Other threads may append."""
+        self.last_error: ErrorKind | None = None
+        """Why the latest attempt to send failed; None after one that did not."""
+        self._deliver = deliver
+        self._on_room = on_room
+        self._own = options.own
+        self._filters: tuple[BusFilter, ...] = options.filters
+        self.sending = False
+        """Whether the controller holds the first frame of the queue. If so, `pump` is not needed for those after it."""
+        self._states, self._errors = options.states, options.errors
+        name = shared.free_name(options.name)
+        self.controller = shared.plug_in(self, node_of(options, name))
+        self._listen_only = options.listen_only
+        self._set_callbacks(self.controller)
+        if self._listen_only or not shared.powered:
+            self.controller.power_off()
+        shared.bus.observers.append(self._observe)
+
+    @property
+    def state(self) -> ControllerState:
+        """The state of the controller; one that only listens is error active."""
+        return ControllerState.ACTIVE if self._listen_only else self.controller.state
+
+    @property
+    def error_counters(self) -> tuple[int, int]:
+        """The transmit and receive error counters."""
+        confinement = self.controller.confinement
+        return confinement.transmit, confinement.receive
+
+    def pump(self) -> None:
+        """Send what has been put into the queue."""
+        self.shared.bus.timeline.catch_up()
+        self._next()
+
+    def set_filters(self, filters: Sequence[BusFilter]) -> None:
+        """Deliver frames that pass one of these; all if there is none."""
+        self._filters = tuple(filters)
+
+    def flush(self) -> None:
+        """Empty the queue, but for a frame whose start of frame has begun."""
+        self.shared.bus.timeline.catch_up()
+        held = self.sending and not self.controller.abort()
+        kept = [self.queue[0]] if held else []
+        self.queue.clear()
+        self.queue.extend(kept)
+        self.sending = held
+        self._on_room()
+
+    def restart(self) -> None:
+        """Leave bus-off, after 128 times 11 recessive bits."""
+        self.shared.bus.timeline.catch_up()
+        self.controller.restart()
+
+    def power_off(self) -> None:
+        if self.controller.state is ControllerState.DOWN:
+            return
+        self.controller.power_off()
+        self.sending = False
+        self._change(ControllerState.DOWN, self.controller.clock.monotonic())
+
+    def power_on(self) -> None:
+        if not self._listen_only:
+            self.controller.power_on()
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self.shared.bus.timeline.catch_up()
+        self.shared.bus.observers.remove(self._observe)
+        _clear_callbacks(self.controller)
+        self.shared.unplug(self.controller)
+        self.queue.clear()
+
+    # From the controller
+
+    def _set_callbacks(self, controller: CanController) -> None:
+        controller.on_receive = self._received
+        controller.on_sent = self._sent
+        controller.on_error = self._given_up
+        controller.on_lost = self._lost
+        controller.on_state = self._change
+
+    def _received(self, frame: Frame | OtherFrame, stamp: int) -> None:
+        if not self._filters or any(each.passes(frame) for each in self._filters):
+            self._deliver(BusFrame(frame, stamp, self.shared.utc(stamp)))
+
+    def _sent(self, frame: Frame | OtherFrame, stamp: int) -> None:
+        self.last_error = None
+        self._leave()
+        if self._own and (not self._filters or any(each.passes(frame) for each in self._filters)):
+            self._deliver(BusFrame(frame, stamp, self.shared.utc(stamp), own=True))
+
+    def _given_up(self, _frame: Frame | OtherFrame, kind: ErrorKind, _stamp: int) -> None:
+        self.last_error = kind
+        if kind is ErrorKind.BUS_OFF:
+            self.sending = False  # the frame stays in the queue
+        else:
+            self._leave()
+
+    def _lost(self, _frame: Frame | OtherFrame, _stamp: int) -> None:
+        self._leave()
+
+    def _leave(self) -> None:
+        """Remove the first frame of the queue, and send the next one."""
+        if self.queue:
+            self.queue.popleft()
+        self.sending = False
+        self._next()
+        self._on_room()
+
+    def _next(self) -> None:
+        if self.queue and not self.sending:
+            self.sending = self.controller.request(self.queue[0])  # type: ignore[arg-type]
+
+    def _change(self, state: ControllerState, stamp: int) -> None:
+        if self._states:
+            tx, rx = self.error_counters
+            self._deliver(BusFrame(None, stamp, self.shared.utc(stamp), state=state, tx_errors=tx, rx_errors=rx))
+        self._next()
+
+    # From the bus
+
+    def _observe(self, record: FrameRecord) -> None:
+        if record.error is None:
+            if self._listen_only:
+                self._received(record.frame, self.controller.clock.local(record.end))
+        elif self._listen_only or self.controller.state is not ControllerState.DOWN:
+            self._attempt_failed(record, record.error)
+
+    def _attempt_failed(self, record: FrameRecord, error: ErrorKind) -> None:
+        own = self.controller.name in record.senders
+        if own:
+            self.last_error = error
+        if self._errors:
+            stamp, (tx, rx) = self.controller.clock.local(record.end), self.error_counters
+            self._deliver(BusFrame(None, stamp, self.shared.utc(stamp), own, error, tx_errors=tx, rx_errors=rx))
+
+
+def node_of(options: AttachmentOptions, name: str) -> CanNode:
+    """Return the settings of the node for an attachment."""
+    return CanNode(
+        name,
+        one_shot=options.one_shot,
+        mailboxes=1,
+        offset=options.offset,
+        drift_ppm=options.drift_ppm,
+        loss=options.loss,
+        recovery=options.recovery,
+    )
+
+
+def _clear_callbacks(controller: CanController) -> None:
+    controller.on_receive = controller.on_sent = controller.on_lost = ignore
+    controller.on_error = controller.on_state = ignore

@@ -1,0 +1,323 @@
+"""python-can's interface `r2psim` in real time: buses of one process, threads, notifiers, shutdown."""
+
+import asyncio
+import gc
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+import r2p
+import r2p.sim
+from r2p.msg import Led
+from r2p.sim.transport import running_buses
+from r2p.testing.network import node_in
+
+SOON = 20.0  # seconds: for what happens at once, unless the computer is busy
+
+
+@pytest.fixture
+def channel(request: pytest.FixtureRequest) -> str:
+    return str(request.node.name)
+
+
+def message(identifier: int, data: bytes = b"", **more: Any) -> can.Message:
+    return can.Message(arbitration_id=identifier, data=data, **more)
+
+
+@pytest.fixture
+def pair(channel: str) -> Iterator[tuple[can.BusABC, can.BusABC]]:
+    with (
+        can.Bus(interface="r2psim", channel=channel, served=False) as a,
+        can.Bus(interface="r2psim", channel=channel, served=False) as b,
+    ):
+        yield a, b
+
+
+KINDS = [message(0x1FFFFFFF, bytes(range(8))), message(0x7FF), message(0, b"1")]
+
+
+@pytest.mark.parametrize("sent", KINDS, ids=str)
+def test_messages_go_back_and_forth(pair: tuple[can.BusABC, can.BusABC], sent: can.Message) -> None:
+    for sender, receiver in (pair, pair[::-1]):
+        sender.send(sent)
+        found = receiver.recv(SOON)
+        assert found is not None
+        assert found.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False)
+        assert found.is_rx
+        assert found.channel == receiver.channel  # type: ignore[attr-defined]
+
+
+def test_there_is_nothing_to_receive(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    assert pair[0].recv(0) is None
+    assert pair[0].recv(0.001) is None
+
+
+def test_stamps_are_utc_and_rise(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    a, b = pair
+    for identifier in range(300):
+        a.send(message(identifier), SOON)
+    found = [b.recv(SOON) for _ in range(300)]
+    assert [each and each.arbitration_id for each in found] == list(range(300))
+    stamps = [each.timestamp for each in found if each]
+    assert stamps == sorted(set(stamps))
+    assert abs(stamps[0] - time.time()) < SOON
+
+
+def test_the_description_says_where_the_bus_is(pair: tuple[can.BusABC, can.BusABC], channel: str) -> None:
+    assert str(pair[0]) == f"r2psim {channel}: of this process, 1000000 bit/s"
+    assert pair[0].protocol is can.CanProtocol.CAN_20
+
+
+def test_many_threads_use_one_bus(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    a, b = pair
+
+    def send(number: int) -> None:
+        for each in range(50):
+            a.send(message(number << 8 | each), SOON)
+
+    def receive() -> list[int]:
+        found = [b.recv(SOON) for _ in range(50)]
+        return [each.arbitration_id for each in found if each]
+
+    with ThreadPoolExecutor(8) as threads:
+        receivers = [threads.submit(receive) for _ in range(4)]
+        for sender in [threads.submit(send, number) for number in range(4)]:
+            sender.result()
+        everything = [identifier for receiver in receivers for identifier in receiver.result()]
+    assert sorted(everything) == [number << 8 | each for number in range(4) for each in range(50)]
+
+
+def test_sending_waits_for_room(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    a, b = pair
+    for identifier in range(1000):  # far more than the queue holds
+        a.send(message(identifier))
+    assert [getattr(b.recv(SOON), "arbitration_id", None) for _ in range(1000)] == list(range(1000))
+
+
+def test_a_queue_that_no_frame_leaves_is_an_error(channel: str) -> None:
+    with can.Bus(interface="r2psim", channel=channel, served=False) as alone:
+        for identifier in range(128):
+            alone.send(message(identifier))
+        with pytest.raises(can.exceptions.CanTimeoutError, match="is full: the first one fails again and again"):
+            alone.send(message(1), 0.001)
+        with pytest.raises(can.exceptions.CanTimeoutError, match="the queue of 128 frames is full"):
+            alone.send(message(1), 0)
+        alone.flush_tx_buffer()
+        alone.send(message(1), 0)
+
+
+@pytest.mark.parametrize("timeout", [None, SOON])
+def test_shutdown_ends_calls_that_wait(channel: str, timeout: float | None) -> None:
+    bus = can.Bus(interface="r2psim", channel=channel, served=False, ignore_rx_error_frames=True)
+    with ThreadPoolExecutor(3) as threads:
+        receiving = [threads.submit(bus.recv, timeout) for _ in range(2)]
+        for identifier in range(128):
+            bus.send(message(identifier))
+        waiting: list[Any] = [*receiving, threads.submit(bus.send, message(1), timeout)]
+        bus.shutdown()
+        for each in waiting:
+            with pytest.raises(can.CanOperationError, match=r"closed|is full"):
+                each.result(SOON)
+    calls: list[Callable[[], object]] = [bus.recv, partial(bus.send, message(1)), bus.fileno, bus.flush_tx_buffer]
+    for call in calls:
+        with pytest.raises(can.CanOperationError, match="closed"):
+            call()
+    bus.shutdown()
+
+
+def test_closing_leaves_nothing_behind(channel: str) -> None:
+    def leftovers() -> tuple[int, int]:
+        gc.collect()
+        return threading.active_count(), len(list(Path("/proc/self/fd").glob("*")))  # none where there is no /proc
+
+    before = leftovers()
+    for _ in range(20):
+        with (
+            can.Bus(interface="r2psim", channel=channel, served=False) as a,
+            can.Bus(interface="r2psim", channel=channel, served=False) as b,
+        ):
+            b.fileno()
+            a.send(message(1))
+            assert b.recv(SOON)
+    assert leftovers() == before
+    assert channel not in [name for name, _ in running_buses()]
+
+
+def test_an_unclosed_bus_is_closed_with_its_last_reference(channel: str) -> None:
+    bus = can.Bus(interface="r2psim", channel=channel, served=False)
+    del bus
+    gc.collect()
+    assert channel not in [name for name, _ in running_buses()]
+
+
+def test_notifiers_have_threads(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    a, b = pair
+    reader = can.BufferedReader()
+    with can.Notifier(b, [reader], timeout=0.01):
+        a.send(message(5))
+        found = reader.get_message(SOON)
+    assert found is not None
+    assert found.arbitration_id == 5
+
+
+async def notify_by_event_loop(channel: str) -> None:
+    with (
+        can.Bus(interface="r2psim", channel=channel, served=False) as a,
+        can.Bus(interface="r2psim", channel=channel, served=False) as b,
+    ):
+        reader = can.AsyncBufferedReader()
+        threads = threading.active_count()
+        with can.Notifier(b, [reader], loop=asyncio.get_running_loop()):
+            assert threading.active_count() == threads
+            for identifier in range(50):
+                a.send(message(identifier))
+            async with asyncio.timeout(SOON):
+                assert [(await reader.get_message()).arbitration_id for _ in range(50)] == list(range(50))
+
+
+def test_notifiers_use_event_loops(channel: str) -> None:
+    asyncio.run(notify_by_event_loop(channel))
+
+
+def test_periodic_messages(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    a, b = pair
+    task = a.send_periodic(message(3), 0.001)
+    assert [getattr(b.recv(SOON), "arbitration_id", None) for _ in range(5)] == [3] * 5
+    task.stop()
+
+
+def test_filters(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    a, b = pair
+    b.set_filters([{"can_id": 2, "can_mask": 0x7, "extended": True}])
+    for identifier in range(1, 4):
+        a.send(message(identifier))
+    found = b.recv(SOON)
+    assert found is not None
+    assert found.arbitration_id == 2
+    assert b.filters == [{"can_id": 2, "can_mask": 0x7, "extended": True}]
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"bitrat": 5}, TypeError, "has no option bitrat; it has channel, can_filters, bitrate, receive_own_messages,"),
+        ({"fd": True}, can.CanInitializationError, "CAN 2.0, without CAN FD: open it without fd=True"),
+        ({"bitrate": 300_000}, ValueError, "at 300000 bit/s a bit does not take whole nanoseconds"),
+        ({"noise": 2}, ValueError, "noise is a share"),
+        ({"can_filters": [{"can_id": 1}]}, ValueError, 'a filter is a dict with "can_id" and "can_mask", not'),
+        ({"channel": " lab"}, ValueError, """a channel is the name of a bus, such as "lab", not ' lab'"""),
+    ],
+)
+def test_wrong_options_are_said(options: dict[str, Any], error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        can.Bus(**{"interface": "r2psim", "channel": "x", "served": False, **options})
+    assert "x" not in [name for name, _ in running_buses()]
+
+
+def test_another_bit_rate_is_refused(pair: tuple[can.BusABC, can.BusABC], channel: str) -> None:
+    words = f"the bus {channel} has 1000000 bit/s, not 500000: ask for the same, or for none"
+    with pytest.raises(can.CanInitializationError) as caught:
+        can.Bus(interface="r2psim", channel=channel, bitrate=500_000)
+    assert words in str(caught.value)
+    with can.Bus(interface="r2psim", channel=channel, bitrate=1_000_000) as bus:
+        assert bus.bitrate == 1_000_000  # type: ignore[attr-defined]
+
+
+def test_what_can_does_not_have_is_refused(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    for wrong, words in (
+        (message(1, is_fd=True), "without CAN FD"),
+        (message(1, is_error_frame=True), "error frames come from errors"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            pair[0].send(wrong)
+
+
+def test_channels_are_found(pair: tuple[can.BusABC, can.BusABC], channel: str) -> None:
+    found = can.detect_available_configs("r2psim")
+    assert {"interface": "r2psim", "channel": channel} in found
+    assert {"interface": "r2psim", "channel": "channel-0"} in found
+
+
+async def use_from_threads(channel: str) -> None:
+    shared = r2p.sim.can_bus(channel)
+    with can.Bus(interface="r2psim", channel=channel) as here:
+        a, b = [await asyncio.to_thread(can.Bus, interface="r2psim", channel=channel) for _ in range(2)]
+        with a, b:
+            a.send(message(1))
+            found = await asyncio.to_thread(b.recv, SOON)
+            assert found is not None
+            assert shared.bus.statistics.total.frames == 1
+            with pytest.raises(can.CanOperationError, match=r"the bus stands still, too: use can.Notifier"):
+                [here.recv(SOON) for _ in range(2)]
+
+
+def test_a_bus_of_an_event_loop_is_used_from_threads(channel: str) -> None:
+    asyncio.run(use_from_threads(channel))
+
+
+def test_a_bus_ends_with_its_event_loop(channel: str) -> None:
+    opened: list[can.BusABC] = []
+
+    async def main() -> None:
+        bus = r2p.sim.can_bus(channel)
+        opened.append(await asyncio.to_thread(can.Bus, interface="r2psim", channel=channel))
+        waiting = asyncio.get_running_loop().run_in_executor(None, opened[0].recv, SOON)
+        await asyncio.sleep(0)
+        waits.append(waiting)
+        del bus
+
+    waits: list[asyncio.Future[can.Message | None]] = []
+    asyncio.run(main())
+    for call in (opened[0].recv, partial(opened[0].send, message(1))):
+        with pytest.raises(can.CanOperationError, match="the event loop that ran it has ended"):
+            call()
+    opened[0].shutdown()
+    assert waits[0].done()
+
+
+def test_python_can_first_and_modules_after_it(channel: str) -> None:
+    async def main() -> None:
+        via = f"sim:{channel}"
+        async with (
+            r2p.Module("A", via=via, watchdog=False) as module_a,
+            r2p.Module("B", via=via, watchdog=False) as module_b,
+            node_in(module_a) as alice,
+            node_in(module_b) as bob,
+        ):
+            publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
+            await publisher.wait_subscriber()
+            await publisher.publish(Led(led=7))
+            assert await subscriber.fetch(timeout=SOON) == Led(led=7)
+            with pytest.raises(r2p.TransportError, match="runs in a thread of its own"):
+                r2p.sim.can_bus(channel)
+
+    with can.Bus(interface="r2psim", channel=channel) as spy:
+        asyncio.run(main())
+        assert spy.recv(0)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_fork_has_no_bus(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            pair[0].recv(0)
+        except can.CanOperationError as error:
+            os.write(writer, str(error).encode())
+        finally:
+            os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as pipe:
+        assert pipe.read().endswith("forked from the one that opened the bus: open buses after the fork")
+    os.waitpid(child, 0)
+    pair[0].send(message(1))
+    assert pair[1].recv(SOON)
