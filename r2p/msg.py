@@ -160,6 +160,15 @@ class Tilt(Message):
     """rad."""
 
 
+class TiltRate(Message):
+    """Inclination about one axis, and how fast it changes (topic `tilt`, thesis 7.4.2). 1 fragment."""
+
+    angle: f32 = 0.0
+    """rad."""
+    rate: f32 = 0.0
+    """rad/s."""
+
+
 class IMURaw9(Message):
     """Unfiltered readings of accelerometer, gyroscope and magnetometer (topic `imu_raw`).
 
@@ -318,6 +327,15 @@ class Setpoint(Message):
 
     ticks: i32 = 0
     """Position in ticks, or speed in ticks/s."""
+
+
+class Effort2(Message):
+    """What two motors are to exert, and the age of what that follows from (topic `effort`). 1 fragment."""
+
+    value: tuple[i16, i16] = (0, 0)
+    """Voltage or torque, in units of the motors' controllers."""
+    measured: u32 = 0
+    """UTC of the measurement that it follows from, us modulo 2^32."""
 
 
 class Pose3(Message):

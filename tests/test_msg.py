@@ -48,6 +48,8 @@ SIZES = {
     "GPS": 32,
     "StampedGPS": 40,
     "Setpoint": 4,
+    "TiltRate": 8,
+    "Effort2": 8,
     "Pose3": 12,
     "Odometry": 24,
     "StampedOdometry": 32,

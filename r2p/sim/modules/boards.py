@@ -235,7 +235,7 @@ class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
     message: type[r2p.Message] = Setpoint
     """Their type."""
     ticks: Callable[[Any], float] = lambda message: message.ticks
-    """Converts such a message to ticks or ticks/s."""
+    """Converts such a message to the setpoint of the drive: ticks/s or ticks, or V or Nm, whatever its mode is."""
     timeout: float = 0.2
     """Seconds without a setpoint after which the motor stops."""
     encoder: str = "encoder"
@@ -249,7 +249,27 @@ class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def tune(node: r2p.Node, drive: Drive) -> None:
-    """Let the parameters of a node set gains and limits of a drive. Its angles are in ticks, theirs of the wheel."""
+    """Let the parameters of a node set gains and limits of a drive."""
+    if drive.mode in ("speed", "position"):
+        _tune_control(node, drive)
+    elif drive.mode == "voltage":
+
+        def clip(volts: float) -> None:
+            drive.pid.gains = Gains(0.0, limit=volts)
+
+        limit = drive.gains.limit
+        clip(quantity(node, "voltage_limit", limit, (0.0, 36.0), "V", "Highest voltage at the motor", clip).value)
+
+    def chop(amperes: float) -> None:
+        drive.motor.current_limit = amperes
+
+    most = drive.motor.spec.current_limit
+    doc = "The bridge chops a higher current, which limits the torque"
+    chop(quantity(node, "current_limit", most, (0.0, 20.0), "A", doc, chop).value)
+
+
+def _tune_control(node: r2p.Node, drive: Drive) -> None:
+    """Declare the gains of a closed loop. Its angles are in ticks, those of the parameters of the wheel."""
     ticks, gains = drive.motor.spec.ticks_per_radian, drive.gains
     units = ("V/(rad/s)", "V/rad", "V/(rad/s^2)") if drive.mode == "speed" else ("V/rad", "V/(rad s)", "V/(rad/s)")
 
@@ -259,18 +279,11 @@ def tune(node: r2p.Node, drive: Drive) -> None:
     def control(_value: float) -> None:
         drive.pid.gains = Gains(kp.value / ticks, ki.value / ticks, kd.value / ticks, limit.value)
 
-    def chop(amperes: float) -> None:
-        drive.motor.current_limit = amperes
-
     kp = gain("kp", gains.kp, 100.0, units[0], "Proportional gain of the control of the wheel")
     ki = gain("ki", gains.ki, 10_000.0, units[1], "Its integral gain; with 0 the wheel stays behind")
     kd = gain("kd", gains.kd, 10.0, units[2], "Its derivative gain, of what is measured")
     limit = quantity(node, "voltage_limit", gains.limit, (0.0, 36.0), "V", "Highest voltage at the motor", control)
-    most = drive.motor.spec.current_limit
-    doc = "The bridge chops a higher current, which limits the torque"
-    current = quantity(node, "current_limit", most, (0.0, 20.0), "A", doc, chop)
     control(kp.value)
-    chop(current.value)
 
 
 async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:

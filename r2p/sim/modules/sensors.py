@@ -12,13 +12,11 @@ from collections.abc import Callable, Iterable, Sequence
 import msgspec
 
 import r2p
-from r2p.msg import IMU, IMURaw9, Pressure, Proximity, Tilt
+from r2p.msg import IMU, IMURaw9, Pressure, Proximity, TiltRate
 from r2p.sim.modules.boards import Board, ParameterOptions, Via, paced, quantity, reopens
 from r2p.sim.physics.inertial import (
     ACCELEROMETER,
     BAROMETER_NOISE,
-    FILTER_BIAS_GAIN,
-    FILTER_GAIN,
     GRAVITY,
     GYROSCOPE,
     MAGNETOMETER,
@@ -27,6 +25,7 @@ from r2p.sim.physics.inertial import (
     GyroscopeRange,
     MagnetometerRange,
     MemsSensor,
+    MemsSpec,
     Vector,
     altitude_at,
     pressure_at,
@@ -135,11 +134,19 @@ class Motion(msgspec.Struct, frozen=True):
 class InertialUnit:
     """The inertial sensors, which return counts at their own rates, and the filter; it is a part of a `Plant`."""
 
-    def __init__(self, motion: Callable[[], Motion], noise: random.Random) -> None:
-        self.attitude = ComplementaryFilter()
+    def __init__(
+        self,
+        motion: Callable[[], Motion],
+        noise: random.Random,
+        *,
+        accelerometer: MemsSpec = ACCELEROMETER,
+        gyroscope: MemsSpec = GYROSCOPE,
+        attitude: ComplementaryFilter | None = None,
+    ) -> None:
+        self.attitude = attitude or ComplementaryFilter()
         self._motion = motion
-        self.accelerometer = MemsSensor(ACCELEROMETER, noise)
-        self.gyroscope = MemsSensor(GYROSCOPE, noise)
+        self.accelerometer = MemsSensor(accelerometer, noise)
+        self.gyroscope = MemsSensor(gyroscope, noise)
         self.magnetometer = MemsSensor(MAGNETOMETER, noise)
         self._noise = noise
 
@@ -163,9 +170,9 @@ class InertialUnit:
         """Return the counts of the sensors."""
         return IMURaw9(*self.accelerometer.counts, *self.gyroscope.counts, *self.magnetometer.counts)
 
-    def tilt(self) -> Tilt:
-        """Return the pitch, for a robot that balances on two wheels."""
-        return Tilt(angle=self.attitude.angles[1])
+    def tilt(self) -> TiltRate:
+        """Return the pitch and its rate, for a robot that balances on two wheels."""
+        return TiltRate(angle=self.attitude.angles[1], rate=self._rates()[1] - self.attitude.bias[1])
 
     def pressure(self) -> Pressure:
         """Return the air pressure, and its altitude."""
@@ -201,9 +208,10 @@ async def sensors(node: r2p.Node, unit: InertialUnit) -> None:
     gyro = node.parameter("gyro_range", GyroscopeRange["250dps"], doc="Range of the gyroscope", on_change=rescale)
     mag = node.parameter("mag_range", MagnetometerRange["1.3gauss"], doc="Range of the magnetometer", on_change=rescale)
     doc = "How fast gravity and magnetic field correct the attitude"
-    gain = quantity(node, "filter_gain", FILTER_GAIN, (0.0, 100.0), "1/s", doc, refilter)
+    usual, usual_bias = unit.attitude.gains
+    gain = quantity(node, "filter_gain", usual, (0.0, 100.0), "1/s", doc, refilter)
     doc = "How fast they correct the bias of the gyroscope"
-    bias_gain = quantity(node, "filter_bias_gain", FILTER_BIAS_GAIN, (0.0, 100.0), "1/s^2", doc, refilter)
+    bias_gain = quantity(node, "filter_bias_gain", usual_bias, (0.0, 100.0), "1/s^2", doc, refilter)
     rescale(None)
     refilter(gain.value)
     await asyncio.Event().wait()
@@ -230,7 +238,7 @@ class ImuModule(Board):
         streams: dict[str, tuple[type[r2p.Message], Callable[[], r2p.Message], float]] = {
             "imu": (IMU, unit.imu, period),
             "imu_raw": (IMURaw9, unit.raw, period),
-            "tilt": (Tilt, unit.tilt, period),
+            "tilt": (TiltRate, unit.tilt, period),
             "pressure": (Pressure, unit.pressure, _BARO),
         }
         nodes: dict[str, r2p.NodeFunction] = {"sensors": functools.partial(sensors, unit=unit)}

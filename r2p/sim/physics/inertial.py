@@ -122,6 +122,8 @@ class ComplementaryFilter:
         self.quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self.bias: Vector = (0.0, 0.0, 0.0)
         """Bias of the gyroscope, rad/s."""
+        self.gains = gain, bias_gain
+        """Those that it was made with."""
         self.gain = gain
         """How fast gravity and field win, 1/s."""
         self.bias_gain = bias_gain

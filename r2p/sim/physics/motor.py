@@ -1,4 +1,4 @@
-"""A brushed DC motor with gear and encoder, its load, its closed-loop control, the battery, and thresholds.
+"""A brushed DC motor with gear and encoder, its load, its control, the battery, and thresholds.
 
 The inductance of the winding is left out: its time constant, 0.2 ms, is shorter than every useful step. What is left is
 a first-order system, which `MotorSpec.gain` and `MotorSpec.time_constant` describe completely. The control is that of
@@ -10,7 +10,7 @@ from typing import Literal
 
 import msgspec
 
-Mode = Literal["speed", "position"]
+Mode = Literal["speed", "position", "voltage", "torque"]
 
 _TURN = 2 * math.pi  # rad
 
@@ -165,11 +165,13 @@ class Pid:
         self._integral = self._error = self._slope = self._output = 0.0
         self._measured = None
 
-    def step(self, setpoint: float, measured: float, dt: float) -> float:
-        """Return the output for the next `dt` seconds."""
+    def step(self, setpoint: float, measured: float, dt: float, slope: float | None = None) -> float:
+        """Return the output for the next `dt` seconds. `slope`: of what is measured, if a sensor has it."""
         gains = self._gains
         self._error = error = setpoint - measured
-        self._slope = slope = 0.0 if self._measured is None else (measured - self._measured) / dt
+        if slope is None:
+            slope = 0.0 if self._measured is None else (measured - self._measured) / dt
+        self._slope = slope
         self._measured = measured
         integral = self._integral + gains.ki * error * dt
         wanted = gains.kp * error + integral - gains.kd * slope
@@ -194,15 +196,20 @@ def speed_gains(spec: MotorSpec, load: float, *, frequency: float, damping: floa
 
 
 class Drive:
-    """Closed-loop control of one motor; without a setpoint the winding is shorted, which brakes."""
+    """Control of one motor; without a setpoint the winding is shorted, which brakes.
 
-    def __init__(self, motor: Motor, gains: Gains, *, mode: Mode = "speed") -> None:
+    Speed and position are closed loops around the encoder, a torque is one around the current, a voltage is none.
+    """
+
+    def __init__(self, motor: Motor, gains: Gains | None = None, *, mode: Mode = "speed") -> None:
+        """`gains` are for speed and position; of a voltage, only their limit counts."""
+        gains = gains or Gains(0.0, limit=motor.spec.voltage)
         self.motor = motor
         self.gains = gains
         """The gains that it was made with."""
         self.mode: Mode = mode
         self.setpoint: float | None = None
-        """Ticks (position) or ticks/s (speed); None: stopped."""
+        """Ticks (position), ticks/s (speed), V, or Nm at the wheel (torque); None: stopped."""
         self.pid = Pid(gains)
         """The controller, whose gains may change at any time."""
         self._last_ticks = motor.ticks
@@ -210,7 +217,7 @@ class Drive:
 
     def stop(self) -> None:
         """Short the winding, which brakes, until the next setpoint."""
-        self.setpoint = None
+        self.setpoint = self.motor.regulated = None
         self.motor.voltage = 0.0
         self.pid.reset()
 
@@ -224,7 +231,13 @@ class Drive:
         """Read the encoder, and set the bridge for the next `dt` seconds."""
         ticks = self.motor.ticks
         moved, self._last_ticks = ticks - self._last_ticks, ticks
-        if self.setpoint is not None:
+        if self.setpoint is None:
+            return
+        if self.mode == "torque":
+            self.motor.regulated = self.setpoint / self.motor.spec.constant
+        elif self.mode == "voltage":
+            self.motor.voltage = _clamp(self.setpoint, self.pid.gains.limit)
+        else:
             measured = ticks if self.mode == "position" else moved / dt
             self.motor.voltage = self.pid.step(self.setpoint, measured, dt)
 

@@ -26,6 +26,7 @@ import msgspec
 
 from r2p.sim.physics.inertial import GRAVITY
 from r2p.sim.physics.motor import Motor, MotorSpec
+from r2p.sim.physics.world import Triple
 
 Matrix = list[list[float]]
 
@@ -56,6 +57,10 @@ class PendulumSpec(msgspec.Struct, frozen=True, kw_only=True):
     """kg; up to 50 (thesis 8.3.1)."""
     payload_height: float = 0.7
     """Above the axle, m."""
+
+    def body_velocity(self, left: float, right: float) -> Triple:
+        """Return the velocity of the body (m/s, m/s, rad/s) for these speeds of the wheels, rad/s."""
+        return self.wheel_radius * (left + right) / 2, 0.0, self.wheel_radius * (right - left) / self.track
 
     @property
     def mass(self) -> float:

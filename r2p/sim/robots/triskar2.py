@@ -22,7 +22,7 @@ from typing import Generic, Literal, TypeVar
 import r2p
 from r2p.msg import Battery, Encoder, Odometry, Pose3, Proximity, Speed3, Velocity3
 from r2p.sim.physics.motor import BatterySpec, MotorSpec
-from r2p.sim.physics.world import OmniSpec
+from r2p.sim.physics.world import OmniSpec, Triple
 
 M = TypeVar("M", bound=r2p.Message)
 Traffic = Literal["hrt", "srt", "nrt"]
@@ -75,29 +75,40 @@ class Latest(Generic[M]):
         self._fresh = round(fresh * 1e9)
         self._changed = changed
         self._message: M | None = None
-        self._at = 0
+        self.received = 0
+        """UTC at which the newest message arrived, ns."""
         node.subscribe(topic, type, self._received, queue=1, lossy=True)
 
     @property
     def message(self) -> M | None:
         """The newest message; None if it is not fresh."""
-        return self._message if self._node.now() - self._at <= self._fresh else None
+        return self._message if self._node.now() - self.received <= self._fresh else None
 
     def _received(self, message: M) -> None:
         self._message = message
-        self._at = self._node.now()
+        self.received = self._node.now()
         self._changed()
 
 
 def sender(
-    node: r2p.Node, topic: str, type: type[M], fill: Callable[[], M | None], *, traffic: Traffic, period: float
+    node: r2p.Node,
+    topic: str,
+    type: type[M],
+    fill: Callable[[], M | None],
+    *,
+    traffic: Traffic,
+    period: float,
+    deadline: float = _DEADLINE,
 ) -> Callable[[], object]:
-    """Publish the result of `fill`, None for nothing: every `period` seconds ("hrt"), or when the result is called."""
+    """Publish the result of `fill`, None for nothing: every `period` seconds ("hrt"), or when the result is called.
+
+    `deadline` in s, of soft real-time messages.
+    """
     if traffic == "hrt":
         node.advertise(topic, type, r2p.Periodic(period, fill))
         return lambda: None
     publisher = (
-        node.advertise(topic, type, r2p.Sporadic(deadline=_DEADLINE))
+        node.advertise(topic, type, r2p.Sporadic(deadline=deadline))
         if traffic == "srt"
         else node.advertise(topic, type)
     )
@@ -174,47 +185,55 @@ async def inverse_kinematics(node: r2p.Node, traffic: Traffic = "hrt") -> None:
         await node.spin()
 
 
-async def forward_kinematics(node: r2p.Node) -> None:
-    """Compute `odometry` from the three encoders: the pose since the node started, and the velocity.
+async def forward_kinematics(
+    node: r2p.Node,
+    body_velocity: Callable[..., Triple] = BODY.body_velocity,
+    wheels: int = WHEELS,
+    motor: MotorSpec = MOTOR,
+    encoder_period: float = PERIOD,
+    rounds: int = _ROUNDS,
+) -> None:
+    """Compute `odometry` from the encoders of all wheels: the pose since the node started, and the velocity.
 
-    It pauses while a wheel is silent; the readings of the others count as soon as that is back.
+    `body_velocity` is the kinematics of the robot: what so many wheels make it do. One message is of so many `rounds`
+    of readings. It pauses while a wheel is silent; the readings of the others count as soon as that is back.
     """
     period = node.parameter(
         "encoder_period",
-        PERIOD,
+        encoder_period,
         min=0.005,
         max=0.1,
         unit="s",
         doc="Period of the encoders' messages, as the motor modules have it",
     )
-    odometry = node.advertise("odometry", Odometry, r2p.Sporadic(deadline=_ROUNDS * PERIOD))
-    turned, readings = [0.0] * WHEELS, [0] * WHEELS
+    odometry = node.advertise("odometry", Odometry, r2p.Sporadic(deadline=rounds * encoder_period))
+    turned, readings = [0.0] * wheels, [0] * wheels
 
     def turn(wheel: int, encoder: Encoder) -> None:
-        turned[wheel] += encoder.delta / MOTOR.ticks_per_radian
+        turned[wheel] += encoder.delta / motor.ticks_per_radian
         readings[wheel] += 1
 
-    for wheel in range(WHEELS):
+    for wheel in range(wheels):
         node.subscribe(f"encoder{wheel + 1}", Encoder, functools.partial(turn, wheel), queue=_BACKLOG)
     pose = Pose3()
     x = y = w = 0.0  # moved since the last message, in the frame of the robot
-    rounds = 0
+    done = 0
     while True:
         await node.spin()
         if not all(readings):
             continue
         # All wheels together: one alone would seem to turn the robot.
-        dx, dy, dw = BODY.body_velocity(*turned)
+        dx, dy, dw = body_velocity(*turned)
         heading = pose.w + dw / 2
         cos, sin = math.cos(heading), math.sin(heading)
         pose = Pose3(pose.x + dx * cos - dy * sin, pose.y + dx * sin + dy * cos, pose.w + dw)
-        x, y, w, rounds = x + dx, y + dy, w + dw, rounds + max(readings)
-        turned[:], readings[:] = [0.0] * WHEELS, [0] * WHEELS
-        if rounds >= _ROUNDS:
-            span = rounds * period.value
+        x, y, w, done = x + dx, y + dy, w + dw, done + max(readings)
+        turned[:], readings[:] = [0.0] * wheels, [0] * wheels
+        if done >= rounds:
+            span = done * period.value
             odometry.publish_nowait(Odometry(pose, Velocity3(x / span, y / span, w / span)))
             x = y = w = 0.0
-            rounds = 0
+            done = 0
 
 
 async def battery_monitor(node: r2p.Node) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from r2p.msg import IMU, Battery, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, Tilt
+from r2p.msg import IMU, Battery, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, TiltRate
 from r2p.sim.modules.boards import (
     GatewayModule,
     IoModule,
@@ -205,18 +205,18 @@ async def test_the_imu_finds_its_attitude(r2p_network: Network) -> None:
     plant = Plant([unit], dt=0.0025)
     async with plant, r2p_network.node("PC1") as node, ImuModule(unit=unit, via=r2p_network.transport()):
         imus = node.subscribe("imu", IMU, queue=1)
-        tilts = node.subscribe("tilt", Tilt, queue=1)
+        tilts = node.subscribe("tilt", TiltRate, queue=1)
         raws = node.subscribe("imu_raw", IMURaw9, queue=1)
         pressures = node.subscribe("pressure", Pressure, queue=1)
         await asyncio.sleep(15)
         imu, tilt, raw, pressure = [await each.fetch(1) for each in (imus, tilts, raws, pressures)]
     assert isinstance(imu, IMU)
-    assert isinstance(tilt, Tilt)
+    assert isinstance(tilt, TiltRate)
     assert isinstance(raw, IMURaw9)
     assert isinstance(pressure, Pressure)
     assert (imu.roll, imu.pitch, imu.yaw) == pytest.approx((roll, 0, 0), abs=0.06)
     assert (imu.roll_rate, imu.pitch_rate, imu.yaw_rate) == pytest.approx((0, 0, 0), abs=0.03)
-    assert tilt.angle == pytest.approx(imu.pitch, abs=0.01)
+    assert (tilt.angle, tilt.rate) == pytest.approx((imu.pitch, imu.pitch_rate), abs=0.01)
     assert raw.acc_y == pytest.approx(500, abs=80)
     assert pressure.altitude == pytest.approx(120, abs=1)
 
