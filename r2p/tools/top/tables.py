@@ -165,8 +165,10 @@ class RecentLosses:
 def _has_lost_more(before: TopicFigures, row: TopicFigures) -> bool:
     if before is row:  # as most of them are: a row that has not changed is the same object
         return False
-    pairs = zip(_losses(before), _losses(row), strict=True)
-    return any(old is not None and new is not None and new > old for old, new in pairs)
+    then, now = _losses(before), _losses(row)
+    return then != now and any(
+        old is not None and new is not None and new > old for old, new in zip(then, now, strict=True)
+    )
 
 
 def _topics(snapshot: NetworkSnapshot) -> list[TopicFigures]:
