@@ -118,6 +118,7 @@ class TopicRow:
 
     __slots__ = (
         "_all_counted",
+        "_any_counted",
         "_counted",
         "_is_of_service",
         "_publishers",
@@ -142,6 +143,7 @@ class TopicRow:
         self._counted = [count for count in counts.values() if count is not None]
         is_anonymous = not {each.link for each in view.publishers}.issuperset(view.published_on)
         self._all_counted = len(self._counted) == len(counts) > 0 and not is_anonymous
+        self._any_counted = bool(self._counted) or any(count is not None for _, count in self._subscribers)
 
     def _publisher_count(self, endpoint: Endpoint) -> PublisherCount | None:
         counters = self._sources.counters.get(endpoint.module)
@@ -175,7 +177,7 @@ class TopicRow:
         if self._counted:
             figures.missed = clamp(sum([each.missed for each in self._counted]))
             figures.late = clamp(sum([each.late for each in self._counted]))
-        if self._counted or any(count is not None for _, count in self._subscribers):
+        if self._any_counted:
             figures.lost_on_way = sources.lost.get(name, 0)
         measured = sources.measured.get(name)
         if measured is not None:
