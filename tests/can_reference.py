@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from r2p.codecs.can_bits import Frame
+    from r2p.codecs.can_bits import AnyFrame
 
 INTERMISSION = 3
 
@@ -32,10 +32,20 @@ def stuffed(bits: str) -> str:
 
 
 def on_the_bus(
-    identifier: int, data: bytes, *, extended: bool = True, acknowledged: bool = True, remote: int | None = None
+    identifier: int,
+    data: bytes,
+    *,
+    extended: bool = True,
+    acknowledged: bool = True,
+    remote: int | None = None,
+    code: int | None = None,
 ) -> str:
-    """All bits of a frame, start of frame to end of frame; `remote`: of a remote frame, the length that it asks for."""
-    rtr, length = ("0", len(data)) if remote is None else ("1", remote)
+    """All bits of a frame, start of frame to end of frame.
+
+    `remote`: of a remote frame, the length that it asks for; `code`: the length code, if it is not the size of the
+    data.
+    """
+    rtr, length = ("0", len(data) if code is None else code) if remote is None else ("1", remote)
     if extended:
         id_bits = f"{identifier:029b}"
         head = "0" + id_bits[:11] + "11" + id_bits[11:] + rtr + "00"
@@ -45,31 +55,46 @@ def on_the_bus(
     return stuffed(bits + crc15(bits)) + "1" + ("01" if acknowledged else "11") + "1111111"
 
 
+def wire(frame: AnyFrame, *, acknowledged: bool = True) -> str:
+    """All bits of a frame of any kind."""
+    return on_the_bus(
+        frame.id,
+        frame.data,
+        extended=frame.extended,
+        acknowledged=acknowledged,
+        remote=frame.remote,
+        code=frame.length_code,
+    )
+
+
 @dataclass
 class Node:
     """A controller with any number of mailboxes: `requests` are (from which bit on, frame)."""
 
-    requests: list[tuple[int, Frame]]
+    requests: list[tuple[int, AnyFrame]]
     one_shot: bool = False
-    sending: Frame | None = None
+    sending: AnyFrame | None = None
 
 
 @dataclass
 class Trace:
     """In bits: (start, end, frame, sender), and (bit after the one that was lost, frame, loser)."""
 
-    frames: list[tuple[int, int, Frame, int]] = field(default_factory=list)
-    losses: list[tuple[int, Frame, int]] = field(default_factory=list)
+    frames: list[tuple[int, int, AnyFrame, int]] = field(default_factory=list)
+    losses: list[tuple[int, AnyFrame, int]] = field(default_factory=list)
 
 
 def simulate(nodes: list[Node]) -> Trace:
-    """Run a bus with two nodes or more, bit by bit, until all is sent or lost. No two identifiers may be equal."""
+    """Run a bus with two nodes or more, bit by bit, until all is sent or lost.
+
+    No two frames may be of one identifier and kind.
+    """
     trace = Trace()
     now = 0
     while any(node.requests for node in nodes):
         for node in nodes:
             ready = [frame for at, frame in node.requests if at <= now]
-            node.sending = min(ready, key=lambda frame: frame.id) if ready else None
+            node.sending = min(ready, key=wire) if ready else None  # dominant bits first: what would win
         senders = [node for node in nodes if node.sending]
         now = _frame(now, nodes, senders, trace) if senders else now + 1
     return trace
@@ -78,7 +103,7 @@ def simulate(nodes: list[Node]) -> Trace:
 def _frame(start: int, nodes: list[Node], senders: list[Node], trace: Trace) -> int:
     """One arbitration and its frame; returns when the bus is free again."""
     now = start
-    wires = {id(node): on_the_bus(node.sending.id, node.sending.data) for node in senders if node.sending}
+    wires = {id(node): wire(node.sending) for node in senders if node.sending}
     while now - start < len(wires[id(senders[0])]):
         levels = {id(node): wires[id(node)][now - start] for node in senders}
         bus = min(levels.values())  # wired AND: dominant wins

@@ -6,9 +6,17 @@ import asyncio
 from typing import Any
 
 from r2p.clock import clock_of
-from r2p.codecs.can_bits import Frame, frame_bits
+from r2p.codecs.can_bits import (
+    AnyFrame,
+    Frame,
+    OtherFrame,
+    arbitration_field,
+    bits_until_lost,
+    frame_bits,
+    other_frame_bits,
+)
 from r2p.codecs.rtcan import encode_identifier
-from r2p.sim.can import CanBus, CanController, CanNode, FrameRecord
+from r2p.sim.can import BusError, CanBus, CanController, CanNode, FrameRecord
 
 BIT = 1000  # ns at 1 Mbit/s
 GAP = 3 * BIT
@@ -18,12 +26,17 @@ MIDDLE = Frame(encode_identifier(20, 0x0206), b"soon")
 HIGH = Frame(encode_identifier(63, 0x0207), b"whenever")
 
 
-def bits(frame: Frame) -> int:
-    return frame_bits(frame.id, frame.data)
+def bits(frame: AnyFrame) -> int:
+    return other_frame_bits(frame) if isinstance(frame, OtherFrame) else frame_bits(frame.id, frame.data)
 
 
-def length(frame: Frame) -> int:
+def length(frame: AnyFrame) -> int:
     return bits(frame) * BIT
+
+
+def gives_up(loser: AnyFrame, winner: AnyFrame) -> int:
+    """How long after the start of frame, in ns."""
+    return bits_until_lost(arbitration_field(winner), arbitration_field(loser)) * BIT
 
 
 class Watch:
@@ -32,6 +45,7 @@ class Watch:
     def __init__(self, bus: CanBus) -> None:
         self.records: list[FrameRecord] = []
         self.heard: list[tuple[Any, ...]] = []
+        self.errors: list[tuple[str, BusError, int]] = []
         bus.observers.append(self.records.append)
 
     def add(self, controller: CanController) -> CanController:
@@ -40,19 +54,20 @@ class Watch:
         def write(what: str) -> Any:
             return lambda *args: self.heard.append((what, name, *args))
 
-        controller.on_receive = write("received")
+        controller.on_receive = controller.on_other = write("received")
         controller.on_sent = write("sent")
         controller.on_lost = write("lost")
         controller.on_error = write("error")
         controller.on_late = write("late")
         controller.on_state = write("state")
+        controller.on_bus_error = lambda *args: self.errors.append((name, *args))
         return controller
 
     def of(self, what: str) -> list[tuple[Any, ...]]:
         return [entry[1:] for entry in self.heard if entry[0] == what]
 
     @property
-    def spans(self) -> list[tuple[int, int, Frame]]:
+    def spans(self) -> list[tuple[int, int, AnyFrame]]:
         return [(record.start, record.end, record.frame) for record in self.records]
 
 

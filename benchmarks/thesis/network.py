@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.can_bits import AnyFrame
 from r2p.protocols.rtcan.cycle import timing
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Ready, SlotsGranted
@@ -275,7 +275,7 @@ class Listener:
             self.periodic[message].append(record.start)
             self.payload += 8 * len(frame.data)
 
-    def _unslotted(self, message: int, frame: Frame, end: int) -> None:
+    def _unslotted(self, message: int, frame: AnyFrame, end: int) -> None:
         source = self._sources.get(message)
         if source is not None:
             self._event(source, message, frame.id & 0x7F, frame.data, end)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from benchmarks.thesis.svg import COLOURS, Plot
 from r2p.codecs import rtcan
+from r2p.codecs.can_bits import AnyFrame
 from r2p.codecs.rtcan import Frame
 from r2p.sim import run
 from r2p.sim.can import CanBus, CanNode, FrameRecord
@@ -74,7 +75,7 @@ class Source:
             identifier = rtcan.encode_identifier(self._priority(self.name, left), message)
             self._controller.request(Frame(identifier, _DATA))
 
-    def _sent(self, _frame: Frame, _stamp: int) -> None:
+    def _sent(self, _frame: AnyFrame, _stamp: int) -> None:
         del self.waiting[0]
         self._retry()
 

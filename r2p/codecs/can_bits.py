@@ -1,19 +1,23 @@
-"""CAN frames, and their length in bits: controllers stamp the end of a frame, so its start follows.
+"""CAN frames, and their bits: which frame wins an arbitration and when the others give up, how long a frame takes.
 
-A frame's length in bits depends on its content: after five equal bits the controller stuffs in a sixth, opposite one,
-also in the CRC. Bits are counted a byte at a time: a table has for each state of the stuffing (the last bit, how often)
-and each byte the next state and the number of stuffed bits.
+`Frame` is what RTCAN sends; `OtherFrame` is every other kind of CAN 2.0. Controllers stamp the end of a frame, so its
+start follows from its length. That depends on the content: after five equal bits the controller stuffs in a sixth,
+opposite one, also in the CRC. Bits are counted a byte at a time: a table has for each state of the stuffing (the last
+bit, how often) and each byte the next state and the number of stuffed bits.
 """
 
+from enum import IntEnum
 from functools import lru_cache
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import msgspec
 
 from r2p.errors import MessageError
 
 FRAME_MAX = 8  # bytes in a frame
+LENGTH_CODE_MAX = 15  # codes from 9 on mean 8 bytes, too
 IDENTIFIER_BITS = 29
+STANDARD_BITS = 11
 INTERMISSION = 3  # bits between two frames
 TAIL = 10  # bits after the CRC, never stuffed: CRC delimiter, ACK slot, ACK delimiter, end of frame
 
@@ -38,14 +42,50 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
     id: int
     data: bytes
 
+    extended: ClassVar[bool] = True
+    remote: ClassVar[None] = None
+    length_code: ClassVar[None] = None
+
 
 class OtherFrame(msgspec.Struct, frozen=True):
-    """A frame of another kind: with an 11-bit identifier, or a remote frame, which asks for `remote` bytes."""
+    """A frame of another kind: with an 11-bit identifier; or a remote frame, which asks for `remote` bytes.
+
+    `remote` is the length code that a remote frame carries, 0 to 15. `length_code`: that of a data frame which has 8
+    bytes and says so with a code from 9 to 15, as CAN allows; None is the number of bytes.
+    """
 
     id: int
     data: bytes = b""
     extended: bool = False
     remote: int | None = None
+    length_code: int | None = None
+
+
+AnyFrame: TypeAlias = Frame | OtherFrame
+
+
+class FrameField(IntEnum):
+    """The fields of a frame, with the numbers that SocketCAN's error frames have for them (`CAN_ERR_PROT_LOC_...`)."""
+
+    START = 0x03
+    ID_28_TO_21 = 0x02  # of 11 bits: 10 to 3
+    ID_20_TO_18 = 0x06  # ... 2 to 0
+    SUBSTITUTE_REMOTE = 0x04  # with an 11-bit identifier: the RTR bit
+    EXTENSION = 0x05  # the IDE bit
+    ID_17_TO_13 = 0x07
+    ID_12_TO_5 = 0x0F
+    ID_4_TO_0 = 0x0E
+    REMOTE = 0x0C  # the RTR bit
+    RESERVED_1 = 0x0D
+    RESERVED_0 = 0x09
+    LENGTH = 0x0B
+    DATA = 0x0A
+    CRC = 0x08
+    CRC_DELIMITER = 0x18
+    ACK_SLOT = 0x19
+    ACK_DELIMITER = 0x1B
+    END = 0x1A
+    INTERMISSION = 0x12
 
 
 def frame_bits_min(size: int) -> int:
@@ -92,34 +132,83 @@ def start_of_frame(frame: Frame, end: int, bit: int) -> int:
     return end - frame_bits(frame.id, frame.data) * bit
 
 
-def other_frame_bits(frame: OtherFrame) -> int:
-    """Return the bits of a frame that RTCAN does not use. Counts and raises as `frame_bits` does."""
-    if frame.remote is None:
+def other_frame_bits(frame: AnyFrame) -> int:
+    """Return the bits of a frame of any kind. Counts and raises as `frame_bits` does."""
+    check_frame(frame)
+    if frame.remote is None and frame.length_code is None:
         return frame_bits(frame.id, frame.data, extended=frame.extended)
-    if frame.id >> (IDENTIFIER_BITS if frame.extended else 11) or not 0 <= frame.remote <= 0xF:
-        raise MessageError(f"does not fit a frame: identifier {frame.id:#x}, {frame.remote} bytes asked for (0..15)")
-    bits = (_arbitration(frame.id) if frame.extended else frame.id) << 7 | _REMOTE | frame.remote
-    count = (_HEADER if frame.extended else _STANDARD_HEADER) + _CRC
-    return count + (_stuff(_START, bits << _CRC | _crc(bits.to_bytes(5, "big")), count) >> 3) + TAIL
+    bits, count = _up_to_crc(frame)
+    return count + (_stuff(_START, bits, count) >> 3) + TAIL
+
+
+def check_frame(frame: AnyFrame) -> None:
+    """Raise `MessageError` unless CAN has such a frame. Every frame has one form: 29-bit data frames are a `Frame`."""
+    size, remote, code = len(frame.data), frame.remote, frame.length_code
+    width = IDENTIFIER_BITS if frame.extended else STANDARD_BITS
+    wrong = None
+    if frame.id >> width:
+        wrong = f"the identifier {frame.id:#x} has more than {width} bits"
+    elif size > FRAME_MAX:
+        wrong = f"{size} bytes of data (0..{FRAME_MAX})"
+    elif remote is not None and (size or code is not None or not 0 <= remote <= LENGTH_CODE_MAX):
+        wrong = f"a remote frame has no data and asks for 0..{LENGTH_CODE_MAX} bytes, not {size} and {remote}"
+    elif code is not None and not (size == FRAME_MAX < code <= LENGTH_CODE_MAX):
+        wrong = f"{size} bytes of data with length code {code} ({FRAME_MAX + 1}..{LENGTH_CODE_MAX}, with {FRAME_MAX})"
+    elif isinstance(frame, OtherFrame) and frame.extended and remote is None and code is None:
+        wrong = "a data frame with a 29-bit identifier is a Frame, not an OtherFrame"
+    if wrong:
+        raise MessageError(f"does not fit a frame: {wrong}")
+
+
+def wire_identifier(frame: AnyFrame) -> int:
+    """Return the identifier with its flags: `EXTENDED` for 29 bits, `REMOTE` for a remote frame."""
+    return frame.id | (EXTENDED if frame.extended else 0) | (0 if frame.remote is None else REMOTE)
+
+
+def to_wire(frame: AnyFrame, flags: int, end: int) -> WireFrame:
+    """Return a frame as observers of a bus get it, with its flags such as `LOCAL` and the instant of its end."""
+    asked = 0 if frame.remote is None else min(frame.remote, FRAME_MAX)
+    return wire_identifier(frame), frame.data or bytes(asked), flags, end
+
+
+def from_wire(frame: WireFrame) -> AnyFrame:
+    """Return the data frame or remote frame that an observer got."""
+    flagged, data, _, _ = frame
+    identifier, extended = flagged & IDENTIFIER_MASK, flagged & EXTENDED != 0
+    if flagged & REMOTE:
+        return OtherFrame(identifier, b"", extended, len(data))
+    return Frame(identifier, data) if extended else OtherFrame(identifier, data)
+
+
+def arbitration_field(frame: AnyFrame) -> int:
+    """Return the 32 bits after the start of frame that decide the arbitration, as a number: the lowest wins.
+
+    29 bits are sent as 11 bits, a recessive SRR and IDE, 18 bits, RTR; 11 bits with RTR and a dominant IDE, after which
+    the arbitration is over. So of one base identifier a data frame with 11 bits comes before a remote one, and both
+    before 29 bits.
+    """
+    identifier = frame.id
+    if frame.__class__ is Frame:  # most
+        return identifier >> 18 << 21 | 0b11 << 19 | (identifier & 0x3FFFF) << 1
+    remote = frame.remote is not None
+    if frame.extended:
+        return _arbitration(identifier) << 1 | remote
+    return identifier << 21 | remote << 20
 
 
 def bits_until_lost(winner: int, loser: int) -> int:
     """Return the bits from the start of frame to the end of the bit where `loser` gives up: the first that differs.
 
-    Both are 29-bit identifiers, `winner` the lower one.
+    Both are from `arbitration_field`, `winner` the lower one.
     """
-    bit = (winner ^ loser).bit_length() - 1
-    before = IDENTIFIER_BITS - bit
-    if bit <= 17:
-        before += 2  # SRR and IDE are sent between bits 18 and 17
-    return before + _stuffed(_arbitration(winner) >> 32 - before, before) + 1
+    after = (winner ^ loser).bit_length()
+    before = _ARBITRATION - after  # all of them are the same in both frames
+    return before + _stuffed(winner >> after, before) + 1
 
 
-def wire_bits(frame: Frame) -> str:
+def wire_bits(frame: AnyFrame) -> str:
     """Return the bits of a frame as sent, `0` dominant, with stuff bits. Slow: for error frames."""
-    count = _HEADER + 8 * len(frame.data)
-    bits = (_arbitration(frame.id) << 7 | len(frame.data)) << 8 * len(frame.data) | int.from_bytes(frame.data, "big")
-    bits, count = bits << _CRC | _crc(bits.to_bytes(13, "big")), count + _CRC
+    bits, count = _up_to_crc(frame)
     sent = ""
     state = _START
     for bit in f"{bits:0{count}b}":
@@ -129,20 +218,68 @@ def wire_bits(frame: Frame) -> str:
     return sent + "1" * TAIL
 
 
+def field_at(frame: AnyFrame, bit: int) -> FrameField:
+    """Return the field in which a bit lies, counted from 1 with stuff bits; these belong to the bit before. Slow."""
+    wire = wire_bits(frame)
+    after = bit - (len(wire) - TAIL)
+    if after > 0:
+        return next((field for field, last in _TAIL_FIELDS if after <= last), FrameField.INTERMISSION)
+    size = 0 if frame.remote is not None else 8 * len(frame.data)
+    fields = [*(_EXTENDED_FIELDS if frame.extended else _STANDARD_FIELDS), (FrameField.DATA, size)]
+    plain, run, last = 0, 0, ""  # bits without stuff bits; a stuff bit ends a run of 5
+    for level in wire[:bit]:
+        if run == 5:
+            run = 0
+        else:
+            plain += 1
+        run = run + 1 if level == last else 1
+        last = level
+    for field, width in fields:
+        plain -= width
+        if plain <= 0:
+            return field
+    return FrameField.CRC
+
+
 # Counting bits. The state of the stuffing is (the last bit) << 2 | (its run length) - 1.
 
 _HEADER = 39  # bits: start of frame, 11 of the identifier, SRR, IDE, 18 of the identifier, RTR, 2 reserved, 4 of length
 _STANDARD_HEADER = _HEADER - 20  # with an identifier of 11 bits, one of the reserved bits, and no SRR
 _REMOTE = 1 << 6  # RTR, with what follows it of the header
+_ARBITRATION = 33  # bits: start of frame, 11 of the identifier, SRR, IDE, 18 of the identifier, RTR
 _CRC = 15
 _START = 1 << 2  # before a frame the bus is recessive; the start of frame is dominant, so how long does not matter
 _Row: TypeAlias = "list[tuple[_Row, int]]"
 """A state of the stuffing: for each byte, and then for each 7 bits, the next state and the number of bits sent."""
 
 
+_ID_FIELDS = [(FrameField.START, 1), (FrameField.ID_28_TO_21, 8), (FrameField.ID_20_TO_18, 3)]
+_ID_FIELDS += [(FrameField.SUBSTITUTE_REMOTE, 1), (FrameField.EXTENSION, 1)]
+_STANDARD_FIELDS = [*_ID_FIELDS, (FrameField.RESERVED_0, 1), (FrameField.LENGTH, 4)]
+_EXTENDED_FIELDS = [*_ID_FIELDS, (FrameField.ID_17_TO_13, 5), (FrameField.ID_12_TO_5, 8), (FrameField.ID_4_TO_0, 5)]
+_EXTENDED_FIELDS += [(FrameField.REMOTE, 1), (FrameField.RESERVED_1, 1), *_STANDARD_FIELDS[-2:]]
+"""The fields before the data, each with its bits."""
+_TAIL_FIELDS = [(FrameField.CRC_DELIMITER, 1), (FrameField.ACK_SLOT, 2), (FrameField.ACK_DELIMITER, 3)]
+_TAIL_FIELDS += [(FrameField.END, TAIL)]
+"""The fields after the CRC, each with its last bit."""
+
+
 def _arbitration(identifier: int) -> int:
     """Return the 32 bits from the start of frame to the end of the identifier."""
     return identifier >> 18 << 20 | 0b11 << 18 | identifier & 0x3FFFF
+
+
+def _up_to_crc(frame: AnyFrame) -> tuple[int, int]:
+    """Return the bits of a frame up to the end of the CRC, without stuff bits, and how many they are."""
+    data = frame.data
+    size = len(data)
+    if frame.remote is None:
+        code = size if frame.length_code is None else frame.length_code
+    else:
+        code = _REMOTE | frame.remote
+    header, count = (_arbitration(frame.id), _HEADER) if frame.extended else (frame.id, _STANDARD_HEADER)
+    bits = (header << 7 | code) << 8 * size | int.from_bytes(data, "big")
+    return bits << _CRC | _crc(bits.to_bytes(13, "big")), count + 8 * size + _CRC
 
 
 @lru_cache(maxsize=4096)

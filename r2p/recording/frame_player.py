@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from r2p.bus import BusMonitor, FrameKind
-from r2p.codecs.can_bits import ERROR, EXTENDED, IDENTIFIER_MASK, Frame, WireFrame, frame_bits
+from r2p.codecs.can_bits import AnyFrame, WireFrame, from_wire, other_frame_bits
 from r2p.errors import TransportError
 from r2p.recording.bag import Bag
 from r2p.recording.frame_reader import BusReader
@@ -124,8 +124,8 @@ class FramePlayer:
         """Yield the frames, each with the instant at which to send it (UTC, ns)."""
         bit = 0 if self._simulated is None else SECOND // self.bus.bitrate
         for frame in self._reader.read(self.bus.name, start=self.start, end=self._end):
-            is_exact = bit and frame.extended and frame.remote is None and not frame.error
-            yield frame.time - (frame_bits(frame.id, frame.data) * bit if is_exact else 0), frame
+            length = other_frame_bits(from_wire(frame.wire)) * bit if bit and not frame.error else 0
+            yield frame.time - length, frame
 
     def _play(self, _time: int, frame: RecordedFrame) -> None:
         assert self._sender is not None
@@ -163,7 +163,7 @@ async def _rtcan_on(monitor: BusMonitor) -> str:
     return ""
 
 
-class SimulatedSender(QueuedSender[Frame]):
+class SimulatedSender(QueuedSender[AnyFrame]):
     """Sends to a simulated bus, as one more node, one frame after the other."""
 
     def __init__(self, can: SimCan) -> None:
@@ -176,11 +176,8 @@ class SimulatedSender(QueuedSender[Frame]):
         controller.on_state = self._on_state
 
     def send(self, frame: WireFrame) -> None:
-        flags = frame[0] & ~IDENTIFIER_MASK
-        if flags not in (EXTENDED, ERROR):
-            self.refused["a simulated bus has data frames with 29 bits only"] += 1
-        elif self.accepts(frame, len(self._waiting)):
-            self._waiting.append(Frame(frame[0] & IDENTIFIER_MASK, frame[1]))
+        if self.accepts(frame, len(self._waiting)):
+            self._waiting.append(from_wire(frame))
             self._empty.clear()
             self._request()
 
@@ -190,12 +187,12 @@ class SimulatedSender(QueuedSender[Frame]):
         else:
             self._empty.set()
 
-    def _on_sent(self, _frame: Frame, _stamp: int) -> None:
+    def _on_sent(self, _frame: AnyFrame, _stamp: int) -> None:
         self.sent += 1
         self._waiting.popleft()
         self._request()
 
-    def _on_error(self, _frame: Frame, _kind: ErrorKind, _stamp: int) -> None:
+    def _on_error(self, _frame: AnyFrame, _kind: ErrorKind, _stamp: int) -> None:
         self.refused["destroyed on the bus"] += 1
         self._waiting.popleft()
         self._request()

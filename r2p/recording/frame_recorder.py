@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any, Self
 
 from r2p.clock import clock_of
-from r2p.codecs.can_bits import ERROR, EXTENDED, Frame, OtherFrame, WireFrame
+from r2p.codecs.can_bits import ERROR, Frame, OtherFrame, WireFrame, to_wire
 from r2p.errors import TransportError
 from r2p.protocols.can_orders import Mailbox, Outcome
 from r2p.recording.entries import BagEntry, MessageEntry
@@ -241,7 +241,7 @@ class _ObservedBus:
         frame = record.frame
         if record.error is None:
             event, text = "frame", ""
-            self._frames.append((frame.id | EXTENDED, frame.data, 0, record.end))
+            self._frames.append(to_wire(frame, 0, record.end))
         else:
             event, text = "error", record.error.value
             identifier, data = encode_error(text)

@@ -23,7 +23,7 @@ import msgspec
 
 from r2p.clock import random_of
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.can_bits import EXTENDED, REMOTE, AnyFrame
 from r2p.errors import TransportError
 from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, Latency
@@ -160,6 +160,7 @@ class SimPort(CanPort, PluggedNode):
         self._listener = listener
         controller = self.controller
         controller.on_receive = listener.on_frame
+        controller.on_other = listener.on_other_frame
         controller.on_sent = self._sent
         controller.on_lost = self._lost
         controller.on_error = self._failed
@@ -176,7 +177,7 @@ class SimPort(CanPort, PluggedNode):
         finally:
             self._up = False
             self._listener = None
-            controller.on_receive = ignore
+            controller.on_receive = controller.on_other = ignore
 
     def transmit(self, order: Transmit) -> None:
         last = None if order.not_after == NEVER else order.not_after
@@ -189,7 +190,9 @@ class SimPort(CanPort, PluggedNode):
             self._confirm(order.mailbox, _LATE, self.now())
 
     def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
-        self.controller.filters = [(0, 0)] if filters is None else filters
+        self.controller.filters = [(0, 0)]
+        if filters is not None:  # for data frames with 29 bits alone
+            self.controller.filters = [(each | EXTENDED, mask | EXTENDED | REMOTE) for each, mask in filters]
 
     def monotonic(self, instant: int) -> int:
         return self._clock.true(instant)
@@ -214,18 +217,18 @@ class SimPort(CanPort, PluggedNode):
 
     # `_sent` and `_lost` are called for each frame, and spare the call of `_confirm`.
 
-    def _sent(self, frame: Frame, stamp: int) -> None:
+    def _sent(self, frame: AnyFrame, stamp: int) -> None:
         if self._listener is not None and self._up:
             self._listener.on_confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _SENT, stamp - self.receive_latency)
 
-    def _lost(self, frame: Frame, stamp: int) -> None:
+    def _lost(self, frame: AnyFrame, stamp: int) -> None:
         if self._listener is not None and self._up:
             self._listener.on_confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _LOST, stamp)
 
-    def _late(self, frame: Frame, stamp: int) -> None:
+    def _late(self, frame: AnyFrame, stamp: int) -> None:
         self._confirm(_MAILBOXES[rtcan.laxity_of(frame.id)], _LATE, stamp)
 
-    def _failed(self, frame: Frame, kind: ErrorKind, stamp: int) -> None:
+    def _failed(self, frame: AnyFrame, kind: ErrorKind, stamp: int) -> None:
         if self._listener is not None and self._up:
             self._listener.on_fault(kind.value)
         self._confirm(_MAILBOXES[rtcan.laxity_of(frame.id)], Outcome.ERROR, stamp)

@@ -1,20 +1,35 @@
 """The bits of frames, against frames that are written down bit by bit."""
 
+import itertools
+from collections import Counter
+from collections.abc import Iterator
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.codecs.can_bits import (
+    EXTENDED,
+    IDENTIFIER_MASK,
+    REMOTE,
+    AnyFrame,
+    FrameField,
+    arbitration_field,
     bits_until_lost,
+    check_frame,
+    field_at,
     frame_bits,
     frame_bits_max,
     frame_bits_min,
+    from_wire,
     other_frame_bits,
+    to_wire,
     wire_bits,
+    wire_identifier,
 )
 from r2p.codecs.rtcan import Frame, OtherFrame, encode_sync
 from r2p.errors import MessageError
-from tests.can_reference import on_the_bus
+from tests.can_reference import on_the_bus, wire
 
 identifiers = st.integers(0, (1 << 29) - 1)
 frame_data = st.binary(max_size=8)
@@ -89,11 +104,129 @@ def test_what_no_frame_has_room_for(identifier: int, size: int, extended: bool) 
         frame_bits(identifier, bytes(size), extended=extended)
 
 
-@given(identifiers, identifiers)
-def test_arbitration_is_lost_in_the_first_bit_that_differs(first: int, second: int) -> None:
-    if first == second:
+def names_of_11_or_29_bits() -> st.SearchStrategy[tuple[int, bool]]:
+    """Identifiers, with whether they have 29 bits: any, and many of a few base identifiers that differ in one bit."""
+    bases = st.sampled_from([0x000, 0x7FF, 0x2AA, 0x2AB])
+    near = st.tuples(bases, st.integers(0, 10)).map(lambda each: each[0] ^ 1 << each[1]) | bases
+    low = st.sampled_from([0, 0x3FFFF, 0x15555]) | st.integers(0, 17).map(lambda bit: 1 << bit)
+    extended = st.tuples(near, low).map(lambda each: (each[0] << 18 | each[1], True))
+    return extended | st.tuples(identifiers, st.just(True)) | st.tuples(near, st.just(False))
+
+
+@st.composite
+def any_frames(draw: st.DrawFn) -> AnyFrame:
+    """Frames of all kinds."""
+    identifier, extended = draw(names_of_11_or_29_bits())
+    kind = draw(st.sampled_from(["data", "data", "remote", "long"]))
+    if kind == "remote":
+        return OtherFrame(identifier, b"", extended, draw(st.integers(0, 15)))
+    if kind == "long":
+        return OtherFrame(identifier, draw(st.binary(min_size=8, max_size=8)), extended, None, draw(st.integers(9, 15)))
+    data = draw(frame_data | runs)
+    return Frame(identifier, data) if extended else OtherFrame(identifier, data)
+
+
+@given(any_frames())
+def test_every_kind_of_frame_on_the_wire(frame: AnyFrame) -> None:
+    bits = wire(frame, acknowledged=False)
+    assert wire_bits(frame) == bits
+    assert other_frame_bits(frame) == len(bits)
+
+
+@given(any_frames(), any_frames())
+def test_the_bus_decides_as_wired_and_does(first: AnyFrame, second: AnyFrame) -> None:
+    """The frame with the first dominant bit where the other is recessive wins; the other gives up after that bit."""
+    fields = arbitration_field(first), arbitration_field(second)
+    one, two = ((each.id, each.extended, each.remote is None) for each in (first, second))
+    assert (fields[0] == fields[1]) == (one == two)
+    if one == two:
         return
-    winner, loser = sorted((first, second))
-    bits = zip(on_the_bus(winner, b""), on_the_bus(loser, b""), strict=False)
-    differ = next(i for i, (a, b) in enumerate(bits) if (a, b) == ("0", "1"))
-    assert bits_until_lost(winner, loser) == differ + 1
+    bits = zip(wire(first), wire(second), strict=False)
+    differ = next(i for i, (a, b) in enumerate(bits) if a != b)
+    assert (wire(first)[differ] == "0") == (fields[0] < fields[1])
+    assert bits_until_lost(min(fields), max(fields)) == differ + 1
+
+
+def test_the_order_of_one_base_identifier() -> None:
+    base = 0x123
+    order: list[AnyFrame] = [
+        OtherFrame(base, b"11 bits"),
+        OtherFrame(base, b"", False, 0),
+        Frame(base << 18, b"29 bits"),
+        OtherFrame(base << 18, b"", True, 0),
+        Frame(base << 18 | 1, b""),
+        OtherFrame(base + 1),
+    ]
+    fields = [arbitration_field(each) for each in order]
+    assert fields == sorted(set(fields))
+
+
+@pytest.mark.parametrize(
+    ("frame", "wrong"),
+    [
+        (Frame(1 << 29, b""), "0x20000000 has more than 29 bits"),
+        (Frame(-1, b""), "more than 29 bits"),
+        (Frame(0, bytes(9)), "9 bytes of data"),
+        (OtherFrame(0x800), "0x800 has more than 11 bits"),
+        (OtherFrame(1 << 29, b"", True, 1), "more than 29 bits"),
+        (OtherFrame(1, b"", False, 16), "asks for 0..15 bytes, not 0 and 16"),
+        (OtherFrame(1, b"x", False, 1), "has no data"),
+        (OtherFrame(1, b"", False, 1, 9), "has no data"),
+        (OtherFrame(1, bytes(7), False, None, 9), "7 bytes of data with length code 9"),
+        (OtherFrame(1, bytes(8), False, None, 8), "with length code 8"),
+        (OtherFrame(1, bytes(8), True), "is a Frame, not an OtherFrame"),
+    ],
+)
+def test_what_is_no_frame(frame: AnyFrame, wrong: str) -> None:
+    with pytest.raises(MessageError, match=wrong):
+        check_frame(frame)
+
+
+@given(any_frames())
+def test_an_identifier_with_its_flags(frame: AnyFrame) -> None:
+    check_frame(frame)
+    flagged = wire_identifier(frame)
+    assert flagged & IDENTIFIER_MASK == frame.id
+    assert (bool(flagged & EXTENDED), bool(flagged & REMOTE)) == (frame.extended, frame.remote is not None)
+
+
+@given(any_frames())
+def test_frames_as_observers_get_them(frame: AnyFrame) -> None:
+    """What a kernel does not pass on is lost: length codes over 8."""
+    seen = to_wire(frame, 4, 5)
+    assert seen[0] == wire_identifier(frame)
+    assert seen[2:] == (4, 5)
+    remote = None if frame.remote is None else min(frame.remote, 8)
+    assert len(seen[1]) == (len(frame.data) if remote is None else remote)
+    back = from_wire(seen)
+    assert (back.id, back.data, back.extended, back.remote) == (frame.id, frame.data, frame.extended, remote)
+    check_frame(back)
+
+
+@given(any_frames())
+def test_fields_of_a_frame(frame: AnyFrame) -> None:
+    """The widths of all fields, stuff bits taken out by hand."""
+    bits = wire(frame)
+    widths = Counter(
+        field_at(frame, number)
+        for number, stuff in enumerate(stuff_bits(bits), start=1)
+        if not stuff or len(bits) - number < 10  # after the CRC there are none
+    )
+    data = 0 if frame.remote is not None else 8 * len(frame.data)
+    expected = {FrameField.START: 1, FrameField.ID_28_TO_21: 8, FrameField.ID_20_TO_18: 3, FrameField.DATA: data}
+    expected |= {FrameField.SUBSTITUTE_REMOTE: 1, FrameField.EXTENSION: 1, FrameField.RESERVED_0: 1}
+    expected |= {FrameField.LENGTH: 4, FrameField.CRC: 15, FrameField.CRC_DELIMITER: 1, FrameField.ACK_SLOT: 1}
+    expected |= {FrameField.ACK_DELIMITER: 1, FrameField.END: 7}
+    if frame.extended:
+        expected |= {FrameField.ID_17_TO_13: 5, FrameField.ID_12_TO_5: 8, FrameField.ID_4_TO_0: 5}
+        expected |= {FrameField.REMOTE: 1, FrameField.RESERVED_1: 1}
+    assert widths == Counter(expected)
+    assert field_at(frame, len(bits) + 1) is FrameField.INTERMISSION
+
+
+def stuff_bits(bits: str) -> Iterator[bool]:
+    """Whether each bit is one that a receiver takes out, up to the CRC."""
+    run = 0
+    for before, bit in itertools.pairwise(" " + bits):
+        yield run == 5
+        run = run + 1 if bit == before else 1

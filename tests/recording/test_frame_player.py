@@ -13,7 +13,7 @@ import r2p
 import r2p.sim
 from r2p.bus import FrameKind
 from r2p.clock import clock_of
-from r2p.codecs.can_bits import Frame
+from r2p.codecs.can_bits import AnyFrame, Frame, OtherFrame
 from r2p.errors import BagError, TransportError
 from r2p.msg import Led
 from r2p.recording.background_writer import BackgroundWriter
@@ -24,7 +24,7 @@ from r2p.recording.frame_recorder import FrameRecorder
 from r2p.recording.frames import BusInfo, FrameEntry
 from r2p.recording.pacing import Pacer
 from r2p.recording.recording_files import RecordingOptions
-from r2p.sim.can import CanNode
+from r2p.sim.can import CanNode, FrameRecord
 from r2p.sim.transport import SimCan
 from r2p.transports.rtcan.transport import RtcanOptions
 
@@ -117,6 +117,27 @@ async def test_played_frames_have_their_instants_to_the_ns(tmp_path: Path) -> No
     assert [frame[1:] for frame in played] == [(frame.id, frame.data) for frame in frames]
     first, began = frames[0].time, played[0][0]
     assert [at - began for at, _, _ in played] == [frame.time - first for frame in frames]
+
+
+@pytest.mark.virtual_time
+async def test_frames_of_every_kind_are_recorded_and_played_to_the_ns(tmp_path: Path) -> None:
+    path = tmp_path / "kinds.mcap"
+    frames: list[AnyFrame] = [OtherFrame(0x123, b"abc"), Frame(0x123, b"12345678")]
+    frames += [OtherFrame(0x12, b"", False, 5), OtherFrame(0x12, b"", True, 0)]
+    bus = SimCan(seed=4)
+    a, _ = (bus.bus.attach(CanNode(name)) for name in "AB")
+    async with recording(path, bus):
+        for frame in frames:
+            a.request(frame)
+            await asyncio.sleep(0.001)
+    records: list[FrameRecord] = []
+    bus.bus.observers.append(records.append)
+    with Bag(path) as bag:
+        async with FramePlayer(bag, bus) as player:
+            await player.run()
+        assert not player.refused
+    assert [record.frame for record in records] == frames
+    assert [record.start - records[0].start for record in records] == [0, 1_000_000, 2_000_000, 3_000_000]
 
 
 @pytest.mark.virtual_time

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.clock import clock_of
-from r2p.codecs.can_bits import Frame, bits_until_lost
+from r2p.codecs.can_bits import EXTENDED, REMOTE, AnyFrame, Frame, OtherFrame, arbitration_field
 from r2p.codecs.rtcan import encode_identifier
 from r2p.errors import Deadlock, MessageError
 from r2p.sim import run
 from r2p.sim.can import CanBus, CanController, CanNode, Latency
 from tests import can_reference
-from tests.can_watch import BIT, GAP, HIGH, LOW, MIDDLE, Watch, at, bits, length, make
+from tests.can_watch import BIT, GAP, HIGH, LOW, MIDDLE, Watch, at, bits, gives_up, length, make
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 # Time
 
@@ -100,21 +103,36 @@ async def test_a_bit_takes_whole_nanoseconds() -> None:
 # Arbitration
 
 
-@st.composite
-def traffic(draw: st.DrawFn) -> list[list[tuple[int, Frame]]]:
-    """What each of 2 to 4 nodes requests: (at which bit, frame). Identifiers are unique, and close to each other."""
+def prefixes(draw: st.DrawFn) -> AnyFrame:
+    """A frame of any kind, one of many that begin with the same bits: ties up to RTR, SRR, IDE, the last bit."""
+    base = draw(st.sampled_from([0x2AA, 0x2AB, 0x2BA, 0x000, 0x7FF]))
+    data = draw(st.binary(max_size=8))
+    remote = draw(st.sampled_from([None, None, 0, 8, 15]))
+    if draw(st.booleans()):
+        return OtherFrame(base, data) if remote is None else OtherFrame(base, b"", False, remote)
+    identifier = base << 18 | draw(st.sampled_from([0, 1, 0x155, 0x3FFFF]))
+    return Frame(identifier, data) if remote is None else OtherFrame(identifier, b"", True, remote)
+
+
+def extended(draw: st.DrawFn) -> AnyFrame:
+    """A frame with a 29-bit identifier, one of many that differ in one bit."""
     near = st.integers(0, 28).map(lambda bit: 0x0AAA5555 ^ 1 << bit)
-    ids = draw(st.lists(near | st.integers(0, (1 << 29) - 1), min_size=2, max_size=10, unique=True))
-    nodes: list[list[tuple[int, Frame]]] = [[] for _ in range(draw(st.integers(2, 4)))]
-    for identifier in ids:
-        frame = Frame(identifier, draw(st.binary(max_size=8)))
+    return Frame(draw(near | st.integers(0, (1 << 29) - 1)), draw(st.binary(max_size=8)))
+
+
+@st.composite
+def traffic(draw: st.DrawFn, make: Callable[[st.DrawFn], AnyFrame]) -> list[list[tuple[int, AnyFrame]]]:
+    """What each of 2 to 4 nodes requests: (at which bit, frame). No two frames have one identifier and kind."""
+    frames = {arbitration_field(each): each for each in [make(draw) for _ in range(draw(st.integers(2, 10)))]}
+    nodes: list[list[tuple[int, AnyFrame]]] = [[] for _ in range(draw(st.integers(2, 4)))]
+    for frame in frames.values():
         when = draw(st.sampled_from([0, 0, 1, 60, 120, 130, 400]) | st.integers(0, 700))
         draw(st.sampled_from(nodes)).append((when, frame))
     return nodes
 
 
-@given(traffic(), st.booleans())
-def test_as_the_bus_that_goes_bit_by_bit(nodes: list[list[tuple[int, Frame]]], one_shot: bool) -> None:
+@given(traffic(extended) | traffic(prefixes), st.booleans())
+def test_as_the_bus_that_goes_bit_by_bit(nodes: list[list[tuple[int, AnyFrame]]], one_shot: bool) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         bus = CanBus(loop)
@@ -132,9 +150,10 @@ def test_as_the_bus_that_goes_bit_by_bit(nodes: list[list[tuple[int, Frame]]], o
         if one_shot:
             losses = [(stamp // BIT, frame, int(name)) for name, frame, stamp in watch.of("lost")]
             assert sorted(losses, key=repr) == sorted(expected.losses, key=repr)
-        received = sorted((stamp // BIT, frame.id, int(name)) for name, frame, stamp in watch.of("received"))
+        received = sorted((stamp // BIT, repr(frame), int(name)) for name, frame, stamp in watch.of("received"))
         everybody = range(len(nodes))
-        assert received == sorted((e, f.id, n) for _, e, f, sender in expected.frames for n in everybody if n != sender)
+        heard = sorted((e, repr(f), n) for _, e, f, sender in expected.frames for n in everybody if n != sender)
+        assert received == heard
 
     run(main)
 
@@ -146,7 +165,7 @@ async def test_one_shot_gives_up_and_says_when() -> None:
     b.request(HIGH, 1)
     await asyncio.sleep(0.01)
     assert [record.frame for record in watch.records] == [LOW]
-    assert watch.of("lost") == [("B", HIGH, bits_until_lost(LOW.id, HIGH.id) * BIT)]
+    assert watch.of("lost") == [("B", HIGH, gives_up(HIGH, LOW))]
     assert b.pending(1) is None
 
 
@@ -189,8 +208,11 @@ async def test_a_mailbox_holds_one_frame() -> None:
 
 
 @pytest.mark.virtual_time
-@pytest.mark.parametrize("frame", [Frame(1 << 29, b""), Frame(-1, b""), Frame(0, bytes(9))])
-async def test_what_is_no_frame(frame: Frame) -> None:
+@pytest.mark.parametrize(
+    "frame",
+    [Frame(1 << 29, b""), Frame(-1, b""), Frame(0, bytes(9)), OtherFrame(0x800), OtherFrame(1, b"", extended=True)],
+)
+async def test_what_is_no_frame(frame: AnyFrame) -> None:
     _, watch, (a, _) = make("A", "B")
     with pytest.raises(MessageError):
         a.request(frame)
@@ -252,7 +274,7 @@ async def test_a_frame_that_has_started_can_not_be_withdrawn(late: int) -> None:
 @pytest.mark.virtual_time
 async def test_a_frame_that_has_lost_can_be_withdrawn_again() -> None:
     _, watch, (a, b) = make("A", "B")
-    lost = bits_until_lost(LOW.id, HIGH.id) * BIT
+    lost = gives_up(HIGH, LOW)
     a.request(LOW)
     b.request(HIGH)
     await at(lost - 1)
@@ -283,6 +305,33 @@ async def test_filters() -> None:
         a.request(frame, box)
     await asyncio.sleep(0.001)
     assert [(name, frame) for name, frame, _ in watch.of("received")] == [("C", LOW), ("B", MIDDLE), ("B", HIGH)]
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(
+    ("filters", "passing"),
+    [
+        ([], "data remote data29 remote29"),
+        ([(0x123, 0x7FF)], "data remote data29 remote29"),  # the flags are left open
+        ([(0x123, 0x7FF | EXTENDED)], "data remote"),
+        ([(0x123 | EXTENDED, 0x7FF | EXTENDED | REMOTE)], "data29"),
+        ([(REMOTE, REMOTE)], "remote remote29"),
+        ([(0x122, 0x7FF), (0x123, EXTENDED | REMOTE | 0x7FF)], "data"),
+    ],
+)
+async def test_filters_with_flags(filters: list[tuple[int, int]], passing: str) -> None:
+    _, watch, (a, b) = make("A", "B")
+    frames: dict[str, AnyFrame] = {
+        "data": OtherFrame(0x123, b"1"),
+        "remote": OtherFrame(0x123, b"", False, 1),
+        "data29": Frame(0x123, b"1"),
+        "remote29": OtherFrame(0x123, b"", True, 1),
+    }
+    b.filters = filters
+    for frame in frames.values():
+        a.request(frame)
+        await asyncio.sleep(0.001)
+    assert [frame for _, frame, _ in watch.of("received")] == [frames[name] for name in passing.split()]
 
 
 # Clocks and delays
@@ -570,6 +619,29 @@ async def test_statistics() -> None:
 
 
 @pytest.mark.virtual_time
+async def test_statistics_of_identifiers_that_have_the_same_number() -> None:
+    bus, _, (a, b) = make("A", "B")
+    frames: list[AnyFrame] = [
+        OtherFrame(0x205),
+        OtherFrame(0x205, b"", False, 2),
+        LOW,
+        OtherFrame(LOW.id, b"", True, 8),
+    ]
+    for frame in frames:
+        a.request(frame)
+        await asyncio.sleep(0.001)
+    a.request(OtherFrame(0))
+    b.request(OtherFrame(0x205))
+    await asyncio.sleep(0.001)
+    frames += [OtherFrame(0), OtherFrame(0x205)]
+    statistics = bus.statistics
+    assert {i: (c.frames, c.lost) for i, c in statistics.by_message.items()} == {0x0205: (2, 0)}
+    assert {i: (c.frames, c.lost) for i, c in statistics.by_standard_id.items()} == {0x205: (3, 1), 0: (1, 0)}
+    assert statistics.total.bits == sum(map(bits, frames))
+    assert statistics.by_node["A"].frames == 5
+
+
+@pytest.mark.virtual_time
 async def test_a_saturated_bus_has_load_1() -> None:
     bus, _, (a, b) = make("A", "B")
     a.on_sent = lambda frame, _: a.request(frame)
@@ -582,6 +654,10 @@ async def test_a_saturated_bus_has_load_1() -> None:
 
 @pytest.mark.virtual_time
 async def test_names_are_unique() -> None:
-    bus, _, _ = make("A")
+    bus, _, (a,) = make("A")
     with pytest.raises(ValueError, match="already a node A on this bus"):
         bus.attach(CanNode("A"))
+    bus.detach(a)
+    again = bus.attach(CanNode("A"))
+    assert again.request(LOW)
+    assert not a.request(LOW)

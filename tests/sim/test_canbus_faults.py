@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from r2p.codecs.can_bits import Frame, wire_bits
+from r2p.codecs.can_bits import EXTENDED, IDENTIFIER_MASK, AnyFrame, Frame, FrameField, OtherFrame, field_at, wire_bits
 from r2p.codecs.rtcan import encode_identifier
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, FrameRecord
 from r2p.sim.can.bus import bits_until_noticed, error_frame_bits, first_difference, flip
@@ -31,13 +31,15 @@ class Watch(can_watch.Watch):
 
     def __init__(self, **settings: Any) -> None:
         self.bus = CanBus(asyncio.get_running_loop(), **settings)
+        self.controllers: list[CanController] = []
         super().__init__(self.bus)
 
     def attach(self, name: str, **settings: Any) -> CanController:
-        return self.add(self.bus.attach(CanNode(name, **settings)))
+        self.controllers.append(self.add(self.bus.attach(CanNode(name, **settings))))
+        return self.controllers[-1]
 
     @property
-    def outcomes(self) -> list[tuple[Frame, ErrorKind | None]]:
+    def outcomes(self) -> list[tuple[AnyFrame, ErrorKind | None]]:
         return [(record.frame, record.error) for record in self.records]
 
 
@@ -176,6 +178,167 @@ async def test_an_error_passive_sender_waits_8_bits_longer() -> None:
     b.request(OTHER)
     await asyncio.sleep(0.001)
     assert b.state is ControllerState.ACTIVE
+
+
+# What controllers see of an error
+
+
+def seen(watch: Watch) -> dict[str, tuple[ErrorKind, int, FrameField, bool, int]]:
+    """What each controller saw, with the bit after which it was told."""
+    return {name: (e.kind, e.bit, e.field, e.sending, at // BIT) for name, e, at in watch.errors}
+
+
+@pytest.mark.virtual_time
+async def test_the_sender_sees_the_error_and_the_others_its_flag() -> None:
+    watch = Watch()
+    for name in "ABC":
+        watch.attach(name, one_shot=True, listen_only=name == "C")
+    a = next(iter(watch.controllers))
+    watch.bus.disturb_next(50)
+    a.request(FRAME)
+    await asyncio.sleep(0.01)
+    level = "1" if wire_bits(FRAME)[49] == "0" else "0"
+    bus = wire_bits(FRAME)[:49] + level
+    noticed = 50 + 6 - (len(bus) - len(bus.rstrip("0")))  # the sixth dominant bit
+    flag = (ErrorKind.STUFF, noticed, field_at(FRAME, noticed), False, noticed)
+    assert seen(watch) == {"A": (ErrorKind.BIT, 50, field_at(FRAME, 50), True, 50), "B": flag, "C": flag}
+    assert [(each.transmit_errors, each.receive_errors) for each in watch.controllers] == [(8, 0), (0, 1), (0, 0)]
+
+
+@pytest.mark.virtual_time
+async def test_after_the_crc_an_error_flag_is_a_form_error() -> None:
+    watch = Watch()
+    a, _ = watch.attach("A"), watch.attach("B")
+    watch.bus.disturb_next(bits(FRAME) - 3)
+    a.request(FRAME)
+    await at(watch, bits(FRAME) * BIT)
+    bit = bits(FRAME) - 3
+    assert seen(watch) == {
+        "A": (ErrorKind.BIT, bit, FrameField.END, True, bit),
+        "B": (ErrorKind.FORM, bit + 1, FrameField.END, False, bit + 1),
+    }
+
+
+@pytest.mark.virtual_time
+async def test_a_collision_and_a_death_are_seen() -> None:
+    watch = Watch()
+    a, b, c = (watch.attach(name, one_shot=True) for name in "ABC")
+    for controller, length in ((a, 1), (b, 2)):
+        controller.request(OtherFrame(0x123, b"", False, length))
+    await at(watch, 100 * BIT)
+    # start, 11 bits of identifier, RTR; IDE, reserved and two of the length are dominant; then one sends 0, the other 1
+    assert {name: each[:4] for name, each in seen(watch).items()} == {
+        "B": (ErrorKind.BIT, 18, FrameField.LENGTH, True),
+        "A": (ErrorKind.BIT, 19, FrameField.LENGTH, True),  # its stuff bit
+        "C": (ErrorKind.STUFF, 19, FrameField.LENGTH, False),
+    }
+    watch.errors.clear()
+    c.request(FRAME)
+    await at(watch, 150 * BIT)
+    c.power_off()
+    await asyncio.sleep(0.001)
+    assert {name: kind for name, (kind, *_) in seen(watch).items()} == {"A": ErrorKind.STUFF, "B": ErrorKind.STUFF}
+
+
+@pytest.mark.virtual_time
+async def test_a_receiver_that_is_not_error_active_loses_a_frame_alone() -> None:
+    watch = Watch()
+    a, deaf, ear = watch.attach("A"), watch.attach("deaf", noise=1.0), watch.attach("ear", noise=1.0, listen_only=True)
+    good = watch.attach("good")
+    deaf.disturb(200)
+    a.request(FRAME)
+    await asyncio.sleep(0.001)
+    bit = bits(FRAME) - 7
+    crc = (ErrorKind.CRC, bit, FrameField.ACK_DELIMITER, False, bit)
+    assert seen(watch) == {"deaf": crc, "ear": crc}
+    assert watch.of("received") == [("good", FRAME, bits(FRAME) * BIT)]
+    assert [each.receive_errors for each in (deaf, ear, good)] == [208, 0, 0]
+
+
+# Controllers that only listen
+
+
+@pytest.mark.virtual_time
+async def test_a_controller_that_only_listens_does_not_acknowledge() -> None:
+    """A lone sender gets no acknowledge, goes error passive and never to bus-off (ISO 11898-1, fault confinement).
+
+    Until then its error flag destroys the frame for the listener; after that it is recessive, and the listener
+    receives each attempt.
+    """
+    watch = Watch()
+    a, ear = watch.attach("A"), watch.attach("ear", listen_only=True)
+    a.request(FRAME)
+    await asyncio.sleep(0.1)
+    assert (a.state, a.transmit_errors) == (ControllerState.PASSIVE, 128)
+    assert {error for _, error in watch.outcomes} == {ErrorKind.ACK}
+    kinds = [(error.kind, error.field) for name, error, _ in watch.errors if name == "ear"]
+    assert kinds == [(ErrorKind.FORM, FrameField.ACK_DELIMITER)] * 16
+    received = [stamp for name, _, stamp in watch.of("received") if name == "ear"]
+    assert received == [record.start + bits(FRAME) * BIT for record in watch.records[16:]]
+    assert (ear.state, ear.receive_errors) == (ControllerState.ACTIVE, 0)
+
+
+@pytest.mark.virtual_time
+async def test_a_controller_that_only_listens_hears_as_the_others_do_and_sends_nothing() -> None:
+    watch = Watch()
+    a, b, ear = watch.attach("A"), watch.attach("B"), watch.attach("ear", listen_only=True)
+    b.request(OTHER)
+    a.request(FRAME)
+    await at(watch, 50 * BIT)
+    with pytest.raises(IndexError, match="ear only listens"):
+        ear.request(FRAME)
+    with pytest.raises(IndexError, match="ear only listens"):
+        ear.babble(FRAME)
+    await asyncio.sleep(0.01)
+    assert [(frame, stamp) for name, frame, stamp in watch.of("received") if name == "ear"] == [
+        (record.frame, record.end) for record in watch.records
+    ]
+    ear.power_off()
+    a.request(FRAME)
+    await asyncio.sleep(0.01)
+    ear.power_on()
+    a.request(OTHER)
+    await asyncio.sleep(0.01)
+    assert [frame for name, frame, _ in watch.of("received") if name == "ear"] == [FRAME, OTHER, OTHER]
+
+
+# Errors to order
+
+
+@pytest.mark.virtual_time
+async def test_the_next_frames_of_an_identifier_are_destroyed() -> None:
+    watch = Watch()
+    a, _ = watch.attach("A", one_shot=True), watch.attach("B")
+    watch.bus.disturb_next(20, 2, identifier=0x123)
+    frames: list[AnyFrame] = [
+        OtherFrame(0x123),
+        Frame(0x123, b""),
+        OtherFrame(0x123, b"", False, 0),
+        *[OtherFrame(0x123)] * 2,
+    ]
+    for frame in frames:
+        a.request(frame)
+        await asyncio.sleep(0.001)
+    bit = ErrorKind.BIT
+    assert watch.outcomes == list(zip(frames, [bit, None, None, bit, None], strict=True))
+    watch.bus.disturb_next(20, identifier=0x123 | EXTENDED)
+    for frame in frames:
+        a.request(frame)
+        await asyncio.sleep(0.001)
+    assert [error for _, error in watch.outcomes[5:]] == [None, bit, None, None, None]
+
+
+@pytest.mark.virtual_time
+async def test_the_next_frames_of_a_node_are_destroyed() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    watch.bus.disturb_next(count=3, sender="B")
+    watch.bus.disturb_next(count=0)
+    for controller, frame in ((a, FRAME), (b, OTHER)):
+        controller.request(frame)
+    await asyncio.sleep(0.01)
+    assert watch.outcomes == [(FRAME, None), *[(OTHER, ErrorKind.BIT)] * 3, (OTHER, None)]
+    assert len({record.bits for record in watch.records[1:4]}) > 1  # anywhere in the frame
 
 
 # Collisions
@@ -355,7 +518,7 @@ async def test_a_node_that_dies_in_the_middle_of_its_frame() -> None:
 async def test_frames_that_a_node_filters_out_make_up_for_errors_all_the_same() -> None:
     watch = Watch()
     a, b = watch.attach("A"), watch.attach("B")
-    b.filters = [(OTHER.id, -1)]
+    b.filters = [(OTHER.id, IDENTIFIER_MASK)]
     b.disturb(2)
     for number, frame in enumerate([FRAME, OTHER, FRAME, FRAME]):
         a.request(frame)

@@ -6,9 +6,8 @@ import asyncio
 
 import pytest
 
-from r2p.codecs.can_bits import bits_until_lost
 from r2p.sim.can import Latency
-from tests.can_watch import BIT, GAP, HIGH, LOW, MIDDLE, at, length, make
+from tests.can_watch import BIT, GAP, HIGH, LOW, MIDDLE, at, gives_up, length, make
 
 
 @pytest.mark.virtual_time
@@ -93,9 +92,7 @@ async def test_who_has_lost_is_not_late_as_well(told: str, one_shot: bool) -> No
     a.request(LOW)
     b.request(HIGH, not_after=BIT)
     await asyncio.sleep(0.001)
-    assert [entry for entry in watch.heard if entry[0] in {"lost", "late"}] == [
-        (told, "B", HIGH, bits_until_lost(LOW.id, HIGH.id) * BIT)
-    ]
+    assert [entry for entry in watch.heard if entry[0] in {"lost", "late"}] == [(told, "B", HIGH, gives_up(HIGH, LOW))]
     assert [record.frame for record in watch.records] == [LOW]
 
 

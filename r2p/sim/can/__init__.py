@@ -20,6 +20,7 @@ from r2p.sim.can.bus import CanBus
 from r2p.sim.can.controller import CanController
 from r2p.sim.can.records import (
     ArbitrationLoss,
+    BusError,
     CanNode,
     ControllerState,
     Count,
@@ -32,6 +33,7 @@ from r2p.sim.can.timeline import LocalAlarm, LocalClock, Timeline, TimelineTimer
 
 __all__ = [
     "ArbitrationLoss",
+    "BusError",
     "CanBus",
     "CanController",
     "CanNode",

@@ -12,9 +12,20 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 
-from r2p.codecs.can_bits import INTERMISSION, TAIL, bits_until_lost, frame_bits, wire_bits
-from r2p.sim.can.controller import RECESSIVE_BITS, BusWire, CanController
-from r2p.sim.can.records import ArbitrationLoss, CanNode, ControllerState, ErrorKind, FrameRecord, Statistics
+from r2p.codecs.can_bits import (
+    EXTENDED,
+    INTERMISSION,
+    TAIL,
+    Frame,
+    bits_until_lost,
+    field_at,
+    frame_bits,
+    other_frame_bits,
+    wire_bits,
+    wire_identifier,
+)
+from r2p.sim.can.controller import RECESSIVE_BITS, BusWire, CanController, ignore
+from r2p.sim.can.records import ArbitrationLoss, BusError, CanNode, ControllerState, ErrorKind, FrameRecord, Statistics
 from r2p.sim.can.timeline import Timeline
 from r2p.units import NEVER, SECOND
 
@@ -22,13 +33,14 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Sequence
 
-    from r2p.codecs.can_bits import Frame
+    from r2p.codecs.can_bits import AnyFrame
     from r2p.sim.can.controller import ControllerMailboxes, TransmitRequest
 
 _FLAG: Final = 6  # bits of an error flag
 _DELIMITER: Final = 8  # recessive bits that end an error frame
 _SUSPEND: Final = 8  # bits that an error passive sender waits longer before its next frame
 _BITS_AFTER_ACK: Final = TAIL - 2  # bits that follow the acknowledge slot
+_BITS_AFTER_ACK_DELIMITER: Final = TAIL - 3  # by then, receivers have compared the CRC
 _RECOVERY_SEQUENCES: Final = 128  # times 11 recessive bits, until a controller leaves bus-off
 _CACHED_MAX: Final = 4096  # identifiers for which it is known which controllers they concern
 
@@ -37,12 +49,16 @@ V = TypeVar("V")
 
 
 class _Transfer(msgspec.Struct, eq=False):
-    """A frame on the wire: its senders, its receivers, and whether an error frame will end it."""
+    """A frame on the wire: its senders, its receivers, and whether an error frame will end it.
 
-    frame: Frame
+    `receivers` acknowledge it; `silent` ones only listen.
+    """
+
+    frame: AnyFrame
     requests: list[TransmitRequest]
     names: tuple[str, ...]
     receivers: Sequence[CanController]
+    silent: Sequence[CanController]
     start: int
     bits: int
     destroyed: bool = False
@@ -52,8 +68,36 @@ class _Transfer(msgspec.Struct, eq=False):
         return [request.owner for request in self.requests]
 
 
+class _Error(msgspec.Struct, eq=False):
+    """An error frame: what the nodes `by` have detected after these bits on the bus, and the level of their flags.
+
+    `unseen`: controllers that only listen do not notice it.
+    """
+
+    kind: ErrorKind
+    bus: str
+    by: Sequence[CanController]
+    flag: str
+    unseen: bool = False
+
+
+class _Disturbance(msgspec.Struct, eq=False):
+    """Bit errors to come: `count` frames of this identifier and sender, if given, lose this bit, or a random one."""
+
+    bit: int | None
+    count: int
+    identifier: int | None
+    sender: str | None
+
+    def hits(self, transfer: _Transfer) -> bool:
+        """Return whether this frame is one of them."""
+        return (self.sender is None or self.sender in transfer.names) and (
+            self.identifier is None or self.identifier == wire_identifier(transfer.frame)
+        )
+
+
 class CanBus(BusWire):
-    """A CAN 2.0B bus with extended identifiers.
+    """A CAN 2.0 bus: identifiers of 11 and of 29 bits, data and remote frames.
 
     `timeline` is true time. `statistics` counts from the start. `observers` are called with a `FrameRecord` at the end
     of each frame and of each attempt that failed, `loss_observers` with an `ArbitrationLoss` at the start of the frame
@@ -81,7 +125,7 @@ class CanBus(BusWire):
         self._names: set[str] = set()
         self._listeners = Listeners()
         self._noisy = False  # whether a node has noise of its own
-        self._disturbed_bits: list[int] = []  # of the next frames
+        self._disturbances: list[_Disturbance] = []
         self._free = 0  # from when on a frame may start
         self._contenders: dict[ControllerMailboxes, None] = {}  # all that may have something to send, in order
         self._start: int | None = None  # of the next frame
@@ -100,9 +144,23 @@ class CanBus(BusWire):
         self._noisy = self._noisy or node.noise > 0
         return controller
 
-    def disturb_next(self, bit: int) -> None:
-        """Give the next frame a bit error at this bit, counted from 1, stuff bits included."""
-        self._disturbed_bits.append(bit)
+    def detach(self, controller: CanController) -> None:
+        """Disconnect a node for good, as if its power was cut. Another one may have its name."""
+        controller.power_off()
+        self._names.discard(controller.name)
+
+    def disturb_next(
+        self, bit: int | None = None, count: int = 1, *, identifier: int | None = None, sender: str | None = None
+    ) -> None:
+        """Destroy the next `count` frames with a bit error; each attempt to send counts, also that of a frame again.
+
+        `bit` is the bit that is inverted, counted from 1 with stuff bits, or the last bit of a frame that is shorter;
+        None draws one for each frame, from the seed. With `identifier` (with flags: see `wire_identifier`) or `sender`,
+        only frames with that identifier or of that node count. Several calls wait for their frames side by side; for a
+        frame that more than one waits for, the first counts.
+        """
+        if count > 0:
+            self._disturbances.append(_Disturbance(bit, count, identifier, sender))
 
     def load(self) -> float:
         """Return the share of the time that the bus was occupied since the start or `reset_statistics`."""
@@ -209,15 +267,15 @@ class CanBus(BusWire):
 
     def _winners(self, contestants: list[TransmitRequest], start: int) -> list[TransmitRequest]:
         """Return the frames with the lowest identifier; the others lose at the bit where they differ from it."""
-        lowest = min([request.frame.id for request in contestants])
+        lowest = min([request.rank or request.find_rank() for request in contestants])
         for request in contestants:
-            if request.frame.id != lowest:
-                at = start + bits_until_lost(lowest, request.frame.id) * self.bit
-                self.statistics.add_lost(request.owner.name, request.frame.id)
+            if request.rank != lowest:
+                at = start + bits_until_lost(lowest, request.rank) * self.bit
+                self.statistics.add_lost(request.owner.name, request.frame)
                 for observer in self.loss_observers:
                     observer(ArbitrationLoss(start, at, request.frame, request.owner.name))
                 request.owner.lose_arbitration(request, at)
-        return [request for request in contestants if request.frame.id == lowest]
+        return [request for request in contestants if request.rank == lowest]
 
     # A frame
 
@@ -227,7 +285,7 @@ class CanBus(BusWire):
         end = start + transfer.bits * self.bit
         for request in requests:
             request.busy_until = end
-        if (self.noise or self._noisy or self._disturbed_bits) and self._hit(transfer):
+        if (self.noise or self._noisy or self._disturbances) and self._hit(transfer):
             return
         if transfer.receivers:
             self.timeline.at(end, self._finish, transfer, end)
@@ -237,12 +295,14 @@ class CanBus(BusWire):
     def _transfer_of(self, requests: list[TransmitRequest], start: int, excluded: Sequence[CanController]) -> _Transfer:
         frame, owner = requests[0].frame, requests[0].owner
         if len(requests) == 1 and not excluded:
-            names, receivers = self._listeners.audience[owner]
+            names, receivers, silent = self._listeners.audience[owner]
         else:
             owners = [request.owner for request in requests]
             names = tuple([owner.name for owner in owners])
             receivers = [node for node in self._listeners.live if node not in owners and node not in excluded]
-        return _Transfer(frame, requests, names, receivers, start, frame_bits(frame.id, frame.data))
+            silent = self._listeners.silent.copy()
+        bits = frame_bits(frame.id, frame.data) if frame.__class__ is Frame else other_frame_bits(frame)
+        return _Transfer(frame, requests, names, receivers, silent, start, bits)
 
     def _finish(self, transfer: _Transfer, end: int) -> None:
         if transfer.destroyed:
@@ -250,8 +310,8 @@ class CanBus(BusWire):
         frame = transfer.frame
         for request in transfer.requests:
             request.owner.complete(request, end)
-        for node in self._listeners.concerned[frame.id]:
-            if node in transfer.receivers:
+        for node in self._listeners.concerned[frame.id if frame.__class__ is Frame else ~wire_identifier(frame)]:
+            if node in transfer.receivers or node in transfer.silent:
                 node.receive(frame, end)
         self._over(transfer, transfer.bits, None, end)
 
@@ -274,20 +334,44 @@ class CanBus(BusWire):
 
     def _hit(self, transfer: _Transfer) -> bool:
         """Decide whether noise hits this frame. True: the frame is destroyed."""
-        if self._disturbed_bits or self._numbers.random() < self.noise:
-            bit = self._disturbed_bits.pop(0) if self._disturbed_bits else self._numbers.randrange(1, transfer.bits + 1)
+        disturbed, bit = self._disturbed(transfer)
+        if disturbed or self._numbers.random() < self.noise:
+            bit = bit or self._numbers.randrange(1, transfer.bits + 1)
             bus = flip(wire_bits(transfer.frame), min(bit, transfer.bits))
             self._destroy(transfer, bus, ErrorKind.BIT, transfer.owners)
             return True
-        for node in list(transfer.receivers):
+        for node in (*transfer.receivers, *transfer.silent):
             if node.node.noise and node.numbers.random() < node.node.noise:
-                node.disturb(8)
-                if node.state is ControllerState.ACTIVE:
+                if not node.node.listen_only:
+                    node.disturb(8)
+                if node.state is ControllerState.ACTIVE and not node.node.listen_only:
                     bit = node.numbers.randrange(1, transfer.bits + 1)
                     self._destroy(transfer, wire_bits(transfer.frame)[:bit], ErrorKind.BIT, [node])
                     return True
-                transfer.receivers = [each for each in transfer.receivers if each is not node]
+                self._leave_out(transfer, node)
+                at = transfer.start + (transfer.bits - _BITS_AFTER_ACK_DELIMITER) * self.bit
+                self.timeline.at(at, self._crc_failed, transfer, node, at)
         return False
+
+    def _crc_failed(self, transfer: _Transfer, node: CanController, at: int) -> None:
+        """Let a receiver see alone that the frame was wrong, without an effect on the others."""
+        if not transfer.destroyed:
+            bit = (at - transfer.start) // self.bit
+            node.see_error(BusError(ErrorKind.CRC, bit, field_at(transfer.frame, bit), sending=False), at)
+
+    def _leave_out(self, transfer: _Transfer, node: CanController) -> None:
+        transfer.receivers = [each for each in transfer.receivers if each is not node]
+        transfer.silent = [each for each in transfer.silent if each is not node]
+
+    def _disturbed(self, transfer: _Transfer) -> tuple[bool, int | None]:
+        """Return whether a disturbance waits for this frame, and its bit."""
+        for each in self._disturbances:
+            if each.hits(transfer):
+                each.count -= 1
+                if not each.count:
+                    self._disturbances.remove(each)
+                return True, each.bit
+        return False, None
 
     def _collide(self, requests: list[TransmitRequest], start: int, excluded: Sequence[CanController] = ()) -> None:
         """Let senders of one identifier collide: at the first bit that differs, those that send a 1 see an error."""
@@ -301,13 +385,18 @@ class CanBus(BusWire):
         at = start + bit * self.bit
         for request in hit:  # error passive: their error flag is invisible, so the others go on
             request.busy_until = at
-            self.timeline.at(at, request.owner.fail, request, ErrorKind.BIT, at)
+            self.timeline.at(at, self._give_up, request, bit, at)
         rest = [request for request in requests if request not in hit]
         excluded = [*excluded, *(request.owner for request in hit)]
         if any(request.frame != rest[0].frame for request in rest):
             self._collide(rest, start, excluded)
         else:
             self._send(rest, start, excluded)
+
+    def _give_up(self, request: TransmitRequest, bit: int, at: int) -> None:
+        """Let an error passive sender fail alone, while others go on."""
+        request.owner.fail(request, ErrorKind.BIT, at)
+        request.owner.see_error(BusError(ErrorKind.BIT, bit, field_at(request.frame, bit), sending=True), at)
 
     def _destroy(self, transfer: _Transfer, bus: str, kind: ErrorKind, by: Sequence[CanController]) -> None:
         """Destroy a frame: after these bits on the bus, the nodes `by` have detected an error and send error flags."""
@@ -319,22 +408,49 @@ class CanBus(BusWire):
         end = transfer.start + bits * self.bit
         for request in transfer.requests:
             request.busy_until = end
-        self.timeline.at(detected, self._failed, transfer, kind)
+        error = _Error(kind, bus, by, "0" if active else "1")
+        if kind is ErrorKind.ACK and not active and transfer.silent:
+            self.timeline.at(transfer.start + transfer.bits * self.bit, self._overhear, transfer)
+            error.unseen = True
+        self.timeline.at(detected, self._failed, transfer, error)
         self.timeline.at(end, self._over, transfer, bits, kind, end)
 
-    def _failed(self, transfer: _Transfer, kind: ErrorKind) -> None:
+    def _overhear(self, transfer: _Transfer) -> None:
+        """Let controllers that only listen receive a frame that nobody acknowledged, as the error flag is invisible."""
+        for node in transfer.silent:
+            if node.concerned(wire_identifier(transfer.frame)):
+                node.receive(transfer.frame, self.timeline.now())
+
+    def _failed(self, transfer: _Transfer, error: _Error) -> None:
         now = self.timeline.now()
+        sent = {request.owner: request.frame for request in transfer.requests}
+        receivers = transfer.receivers
         for request in list(transfer.requests):
-            request.owner.fail(request, kind, now)
-        for node in transfer.receivers:
+            request.owner.fail(request, error.kind, now)
+        for node in receivers:
             node.disturb(1)
+        silent = () if error.unseen else transfer.silent
+        for node in (*sent, *receivers, *silent):
+            if node.on_bus_error is not ignore:
+                self._show_error(transfer, error, node, sent.get(node))
+
+    def _show_error(self, transfer: _Transfer, error: _Error, node: CanController, sent: AnyFrame | None) -> None:
+        """Tell a controller of an error frame. If it has not detected the error itself, the error flag is one to it."""
+        wire, bit, kind = wire_bits(transfer.frame), len(error.bus), error.kind
+        if node not in error.by and sent and error.flag == "0":  # it sees a dominant bit where it sends a recessive one
+            bit, kind = wire_bits(sent).index("1", bit) + 1, ErrorKind.BIT
+        elif node not in error.by:
+            bit += bits_until_noticed(error.bus, wire, error.flag)
+            kind = ErrorKind.FORM if bit > len(wire) - TAIL else ErrorKind.STUFF
+        seen = BusError(kind, bit, field_at(transfer.frame, bit), sending=sent is not None)
+        node.see_error(seen, transfer.start + bit * self.bit)
 
     def _node_died(self, transfer: _Transfer, controller: CanController) -> None:
         """Leave a controller out of the frame that is on the wire."""
         sent = -((transfer.start - self.timeline.now()) // self.bit)  # bits so far, rounded up
         before = len(transfer.requests)
         transfer.requests = [request for request in transfer.requests if request.owner is not controller]
-        transfer.receivers = [node for node in transfer.receivers if node is not controller]
+        self._leave_out(transfer, controller)
         if transfer.destroyed:
             return
         wire = wire_bits(transfer.frame)
@@ -351,27 +467,32 @@ class Listeners:
 
     def __init__(self) -> None:
         self.live: list[CanController] = []
+        """Those that acknowledge frames."""
+        self.silent: list[CanController] = []
+        """Those that only listen."""
         self.audience = _Cache(self._find_audience)
-        """By controller: its name, and the receivers of frames that it sends alone."""
+        """By controller: its name, and the receivers and the silent listeners of frames that it sends alone."""
         self.concerned = _Cache(self._find_concerned)
-        """By identifier: the controllers that a good frame concerns."""
+        """The controllers that a good frame concerns; by the id of a `Frame`, by ~`wire_identifier` of others."""
 
     def join(self, controller: CanController) -> None:
-        self.live.append(controller)
+        (self.silent if controller.node.listen_only else self.live).append(controller)
         self.audience.clear()
         self.concerned.clear()
 
     def leave(self, controller: CanController) -> None:
-        if controller in self.live:
-            self.live.remove(controller)
-            self.audience.clear()
-            self.concerned.clear()
+        for controllers in (self.live, self.silent):
+            if controller in controllers:
+                controllers.remove(controller)
+                self.audience.clear()
+                self.concerned.clear()
 
-    def _find_audience(self, owner: CanController) -> tuple[tuple[str, ...], list[CanController]]:
-        return (owner.name,), [each for each in self.live if each is not owner]
+    def _find_audience(self, owner: CanController) -> tuple[tuple[str, ...], list[CanController], list[CanController]]:
+        return (owner.name,), [each for each in self.live if each is not owner], self.silent.copy()
 
-    def _find_concerned(self, identifier: int) -> list[CanController]:
-        return [each for each in self.live if each.concerned(identifier)]
+    def _find_concerned(self, key: int) -> list[CanController]:
+        identifier = key | EXTENDED if key >= 0 else ~key
+        return [each for each in (*self.live, *self.silent) if each.concerned(identifier)]
 
 
 class _Cache(dict[K, V]):

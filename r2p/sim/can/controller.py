@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
-from r2p.codecs.can_bits import FRAME_MAX, IDENTIFIER_BITS
-from r2p.errors import MessageError
+from r2p.codecs.can_bits import FRAME_MAX, IDENTIFIER_BITS, Frame, arbitration_field, check_frame, wire_identifier
 from r2p.sim.can.records import ControllerState, ErrorKind
 from r2p.sim.can.timeline import LocalAlarm, LocalClock
 from r2p.units import NEVER
@@ -20,8 +19,8 @@ from r2p.units import NEVER
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from r2p.codecs.can_bits import Frame
-    from r2p.sim.can.records import CanNode
+    from r2p.codecs.can_bits import AnyFrame, OtherFrame
+    from r2p.sim.can.records import BusError, CanNode
     from r2p.sim.can.timeline import Timeline, TimelineTimer
 
 _BABBLE: Final = -1
@@ -73,17 +72,24 @@ class CanController:
         self.clock = LocalClock(bus.timeline, node.offset, node.drift_ppm)
         self.missed = 0  # frames that the software lost (`CanNode.loss`, `lose_next`)
         self.on_receive: Callable[[Frame, int], object] = ignore
-        """A frame of another node has been received."""
-        self.on_sent: Callable[[Frame, int], object] = ignore
+        """A data frame of another node with a 29-bit identifier has been received."""
+        self.on_other: Callable[[OtherFrame, int], object] = ignore
+        """A frame of another node has been received that has an 11-bit identifier, or is a remote frame."""
+        self.on_sent: Callable[[AnyFrame, int], object] = ignore
         """A frame of this node has been acknowledged."""
-        self.on_lost: Callable[[Frame, int], object] = ignore
+        self.on_lost: Callable[[AnyFrame, int], object] = ignore
         """In one-shot mode: a frame has lost arbitration, and leaves its mailbox now."""
-        self.on_error: Callable[[Frame, ErrorKind, int], object] = ignore
+        self.on_error: Callable[[AnyFrame, ErrorKind, int], object] = ignore
         """A frame has left its mailbox because of an error, in one-shot mode, or because of bus-off."""
-        self.on_late: Callable[[Frame, int], object] = ignore
+        self.on_late: Callable[[AnyFrame, int], object] = ignore
         """A frame has not started by its `not_after`, and has left its mailbox without being sent."""
         self.on_state: Callable[[ControllerState, int], object] = ignore
         """`state` has changed."""
+        self.on_bus_error: Callable[[BusError, int], object] = ignore
+        """An error frame has begun on the bus, of a frame that this controller was sending or receiving.
+
+        The error counters have counted it.
+        """
         self.numbers = random.Random(f"{seed}/{node.name}")
         self.mailboxes = ControllerMailboxes(self._watch)  # for the bus, as is `confinement`
         self.confinement = Confinement(self._changed)
@@ -95,7 +101,8 @@ class CanController:
         self._source = bus.timeline.source
         self._filters: Sequence[tuple[int, int]] = ()
         self._lose_next = 0
-        self._babbled: Frame | None = None
+        self._babbled: AnyFrame | None = None
+        self._mailbox_count = 0 if node.listen_only else node.mailboxes
 
     @property
     def state(self) -> ControllerState:
@@ -107,10 +114,20 @@ class CanController:
         """Return whether the controller sends and receives: it is neither down nor in bus-off."""
         return self.confinement.live
 
+    @property
+    def transmit_errors(self) -> int:
+        """The transmit error counter: over 127 the controller is error passive, over 255 in bus-off."""
+        return self.confinement.transmit
+
+    @property
+    def receive_errors(self) -> int:
+        """The receive error counter: over 127 the controller is error passive."""
+        return self.confinement.receive
+
     # For the node's software
 
     def request(
-        self, frame: Frame, mailbox: int = 0, *, not_before: int | None = None, not_after: int | None = None
+        self, frame: AnyFrame, mailbox: int = 0, *, not_before: int | None = None, not_after: int | None = None
     ) -> bool:
         """Send this frame. False: the mailbox still holds one, or the controller is down or in bus-off.
 
@@ -118,10 +135,11 @@ class CanController:
         nominal latency, so the start of frame is as exact as the jitter. `not_after`: a frame that has not started by
         then is aborted, and `on_late` is called.
 
-        Raises IndexError for a mailbox that the controller does not have, and `MessageError` for an invalid frame.
+        Raises IndexError for a mailbox that the controller does not have (one that only listens has none), and
+        `MessageError` for an invalid frame.
         """
-        if not 0 <= mailbox < self.node.mailboxes:
-            raise IndexError(f"{self.name} has mailboxes 0 to {self.node.mailboxes - 1}, not {mailbox}")
+        if not 0 <= mailbox < self._mailbox_count:
+            self._refuse(mailbox)
         if mailbox in self.mailboxes.requests or not self.confinement.live:
             return False
         given, clock = self._source.elapsed, self.clock
@@ -138,14 +156,18 @@ class CanController:
         request = self.mailboxes.requests.get(mailbox)
         return request is not None and self._withdraw(request)
 
-    def pending(self, mailbox: int = 0) -> Frame | None:
+    def pending(self, mailbox: int = 0) -> AnyFrame | None:
         """Return the frame in this mailbox."""
         request = self.mailboxes.requests.get(mailbox)
         return request.frame if request else None
 
     @property
     def filters(self) -> Sequence[tuple[int, int]]:
-        """Pairs (identifier, mask): frames with `id & mask == identifier` for one of them are received; empty: all."""
+        """Pairs (identifier, mask): frames with `id & mask == identifier` for one of them are received; empty: all.
+
+        `id` is the `wire_identifier` of a frame: with the flags `EXTENDED` (29 bits) and `REMOTE`, which a mask without
+        them leaves open. The callbacks matter, too: frames for a callback that is not set are dropped at no cost.
+        """
         return self._filters
 
     @filters.setter
@@ -168,8 +190,13 @@ class CanController:
 
     # Faults of the node
 
-    def babble(self, frame: Frame | None) -> None:
-        """Send this frame over and over, as a babbling idiot does; None stops it."""
+    def babble(self, frame: AnyFrame | None) -> None:
+        """Send this frame over and over, as a babbling idiot does; None stops it.
+
+        Raises IndexError for a controller that only listens.
+        """
+        if self.node.listen_only:
+            self._refuse(_BABBLE)
         self._babbled = frame
         self.mailboxes.requests.pop(_BABBLE, None)
         self._bus.replan()
@@ -201,12 +228,12 @@ class CanController:
         """Return whether a good frame of another node matters: it passes the filters, or decrements the error count."""
         return self.confinement.receive > 0 or self._is_wanted(identifier)
 
-    def receive(self, frame: Frame, end: int) -> None:
+    def receive(self, frame: AnyFrame, end: int) -> None:
         """Receive a good frame of another node that concerns this one."""
         if self.confinement.receive:
             self.confinement.count_received()
             self._bus.forget_filters()
-            if not self._is_wanted(frame.id):
+            if not self._is_wanted(wire_identifier(frame)):
                 return
         if self._lose_next:
             self._lose_next -= 1
@@ -214,7 +241,7 @@ class CanController:
         elif self.node.loss and self.numbers.random() < self.node.loss:
             self.missed += 1
         else:
-            self._interrupts.deliver(end, self.on_receive, frame)
+            self._interrupts.deliver(end, self.on_receive if frame.__class__ is Frame else self.on_other, frame)
 
     def complete(self, request: TransmitRequest, end: int) -> None:
         """Complete this request: its frame was acknowledged."""
@@ -246,6 +273,10 @@ class CanController:
         self.confinement.count(receive=count)
         self._bus.forget_filters()
 
+    def see_error(self, error: BusError, at: int) -> None:
+        """Tell the software of an error frame."""
+        self._interrupts.deliver(at, self.on_bus_error, error)
+
     def rejoin(self) -> None:
         """Start again with the error counters at 0."""
         self.confinement.restart()
@@ -256,11 +287,8 @@ class CanController:
 
     def _put(self, request: TransmitRequest) -> None:
         frame = request.frame
-        if frame.id >> IDENTIFIER_BITS or len(frame.data) > FRAME_MAX:
-            raise MessageError(
-                f"a frame has an identifier of at most 29 bits and at most {FRAME_MAX} bytes, "
-                f"not {frame.id:#x} with {len(frame.data)} bytes"
-            )
+        if frame.__class__ is not Frame or frame.id >> IDENTIFIER_BITS or len(frame.data) > FRAME_MAX:
+            check_frame(frame)
         self.mailboxes.requests[request.mailbox] = request
         if not self._bus.contend(request) and request.last_start < NEVER:
             self._watch(request)
@@ -314,6 +342,11 @@ class CanController:
         if self._babbled and self.live:
             self._put(TransmitRequest(self, self._babbled, _BABBLE, self._timeline.now(), NEVER))
 
+    def _refuse(self, mailbox: int) -> None:
+        if self.node.listen_only:
+            raise IndexError(f"{self.name} only listens: it has no mailbox to send from")
+        raise IndexError(f"{self.name} has mailboxes 0 to {self._mailbox_count - 1}, not {mailbox}")
+
 
 class Confinement:
     """The two error counters of a controller, and the state that follows from them.
@@ -361,15 +394,22 @@ class TransmitRequest(msgspec.Struct, eq=False):
 
     All instants are true time, in ns: the controller tries to send it from `ready` on; it starts by `last_start` or
     not at all; it is on the wire until `busy_until`. `watched`: an event at `last_start` will abort it if it waits.
+    `rank` is the arbitration field of the frame, once `find_rank` has found it: the lowest wins.
     """
 
     owner: CanController
-    frame: Frame
+    frame: AnyFrame
     mailbox: int
     ready: int
     last_start: int
     busy_until: int = 0
     watched: bool = False
+    rank: int = 0
+
+    def find_rank(self) -> int:
+        """Find and return the rank. Few frames need one: most are alone, or the only one of their controller."""
+        self.rank = rank = arbitration_field(self.frame)
+        return rank
 
 
 class ControllerMailboxes:
@@ -388,8 +428,8 @@ class ControllerMailboxes:
     def choose(self, start: int, end: int) -> TransmitRequest | None:
         """Return the frame that takes part in an arbitration from `start` on; `end` is one bit later.
 
-        Of the frames ready by then it is the one with the lowest identifier, otherwise the first to be ready by `end`:
-        a controller that is ready within the first bit still joins.
+        Of the frames ready by then it is the one that beats the others, otherwise the first to be ready by `end`: a
+        controller that is ready within the first bit still joins.
         """
         chosen = None
         if start < self.not_before:
@@ -400,7 +440,7 @@ class ControllerMailboxes:
                 begins = start
             if begins > request.last_start:
                 continue
-            if begins < end or (begins == end and chosen is not None and request.frame.id < chosen.frame.id):
+            if begins < end or (begins == end and chosen is not None and request.find_rank() < chosen.find_rank()):
                 chosen, end = request, begins
         return chosen
 
@@ -425,7 +465,7 @@ class ControllerMailboxes:
             if request.last_start < NEVER and request is not chosen:
                 self._watch(request)
 
-    def clear(self) -> list[Frame]:
+    def clear(self) -> list[AnyFrame]:
         """Empty all mailboxes and return the frames."""
         frames = [request.frame for mailbox, request in self.requests.items() if mailbox != _BABBLE]
         self.requests.clear()

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from r2p.codecs.can_bits import INTERMISSION, Frame
+from r2p.codecs.can_bits import INTERMISSION
 from r2p.codecs.rtcan import message_of
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Callable
+
+    from r2p.codecs.can_bits import AnyFrame, FrameField
 
 
 class ControllerState(Enum):
@@ -26,11 +28,13 @@ class ControllerState(Enum):
 
 
 class ErrorKind(Enum):
-    """The reason why a frame was not transmitted."""
+    """The reason why a frame was not transmitted, or what a controller detected."""
 
     ACK = "no acknowledge"  # no other node is on the bus
     BIT = "bit error"  # the bus had another level than the sender: noise, or a second sender
-    STUFF = "stuff error"  # the sender lost power in the middle of the frame
+    STUFF = "stuff error"  # six equal bits: the sender lost power in the middle of the frame, or an error flag
+    FORM = "form error"  # a dominant bit after the CRC: an error flag, as the other controllers see it
+    CRC = "CRC error"  # a wrong bit that only a receiver has seen which must not destroy the frame
     BUS_OFF = "bus off"  # the sender's controller went to bus-off while the frame waited in its mailbox
 
 
@@ -63,8 +67,11 @@ class CanNode(msgspec.Struct, frozen=True):
     - `transmit`: from the request until the controller is ready to send. `receive`: from the end of a frame (or the
       lost arbitration, or the error) until the node's software is called; it stamps the frame at that moment.
     - `loss`: the share of received frames that the node's software loses. `noise`: the share of received frames in
-      which only this node sees a bit error; while it is error active, it then destroys the frame for all.
+      which only this node sees a bit error; while it is error active, it then destroys the frame for all. Otherwise it
+      loses the frame alone.
     - `recovery`: a controller in bus-off recovers by itself, after 128 times 11 recessive bits.
+    - `listen_only`: the controller puts no dominant bit on the bus (bus monitoring mode): it neither sends nor
+      acknowledges, an error that only it sees destroys no frame, and its error counters stay 0.
     """
 
     name: str
@@ -77,6 +84,7 @@ class CanNode(msgspec.Struct, frozen=True):
     loss: float = 0.0
     noise: float = 0.0
     recovery: bool = True
+    listen_only: bool = False
 
 
 class FrameRecord(msgspec.Struct, frozen=True, gc=False):
@@ -88,10 +96,24 @@ class FrameRecord(msgspec.Struct, frozen=True, gc=False):
 
     start: int
     end: int
-    frame: Frame
+    frame: AnyFrame
     senders: tuple[str, ...]
     bits: int
     error: ErrorKind | None
+
+
+class BusError(msgspec.Struct, frozen=True):
+    """An error frame, as one controller sees its beginning.
+
+    `kind`: what this controller has detected; those that did not detect the error itself see the error flag of the
+    others, a stuff error or a form error. `bit`: the number of the bit, from the start of frame on, counted from 1,
+    with stuff bits; it lies in `field`. `sending`: this controller was sending the frame.
+    """
+
+    kind: ErrorKind
+    bit: int
+    field: FrameField
+    sending: bool
 
 
 class ArbitrationLoss(msgspec.Struct, frozen=True, gc=False):
@@ -99,7 +121,7 @@ class ArbitrationLoss(msgspec.Struct, frozen=True, gc=False):
 
     start: int
     end: int
-    frame: Frame
+    frame: AnyFrame
     node: str
 
 
@@ -124,13 +146,18 @@ class Count(msgspec.Struct, eq=False):
 
 
 class Statistics:
-    """Totals, and counts by message id and by node. A frame that several nodes sent as one counts for each of them."""
+    """Totals, and counts by identifier and by node. A frame that several nodes sent as one counts for each of them.
+
+    Frames with 29-bit identifiers are counted by the message id that RTCAN has in them, so there are at most 65536
+    counts of them; those with 11-bit identifiers by the whole identifier. Remote frames count for their identifier.
+    """
 
     def __init__(self, bit: int, since: int) -> None:
         """`bit`: the length of a bit in ns. `since`: the instant from which the load counts, in ns."""
         self.since = since
         self._bit = bit
-        self._counts: defaultdict[tuple[int, tuple[str, ...]], Count] = defaultdict(Count)  # by message id and senders
+        # by message id and senders; an 11-bit identifier as its complement, which is negative
+        self._counts: defaultdict[tuple[int, tuple[str, ...]], Count] = defaultdict(Count)
 
     @property
     def total(self) -> Count:
@@ -141,10 +168,13 @@ class Statistics:
 
     @property
     def by_message(self) -> dict[int, Count]:
-        counts: defaultdict[int, Count] = defaultdict(Count)
-        for (message, _), count in self._counts.items():
-            counts[message].add(count)
-        return dict(counts)
+        """Counts of frames with 29-bit identifiers, by message id."""
+        return self._by_key(lambda key: key if key >= 0 else None)
+
+    @property
+    def by_standard_id(self) -> dict[int, Count]:
+        """Counts of frames with 11-bit identifiers, by identifier."""
+        return self._by_key(lambda key: ~key if key < 0 else None)
 
     @property
     def by_node(self) -> dict[str, Count]:
@@ -156,7 +186,8 @@ class Statistics:
 
     def add(self, record: FrameRecord) -> None:
         """Count a frame or a failed attempt."""
-        count = self._counts[message_of(record.frame.id), record.senders]
+        frame = record.frame
+        count = self._counts[message_of(frame.id) if frame.extended else ~frame.id, record.senders]
         if record.error is None:
             count.frames += 1
             count.bits += record.bits
@@ -164,11 +195,19 @@ class Statistics:
             count.errors += 1
             count.error_bits += record.bits
 
-    def add_lost(self, name: str, identifier: int) -> None:
-        """Count an arbitration that this node lost with this identifier."""
-        self._counts[message_of(identifier), (name,)].lost += 1
+    def add_lost(self, name: str, frame: AnyFrame) -> None:
+        """Count an arbitration that this node lost with this frame."""
+        self._counts[message_of(frame.id) if frame.extended else ~frame.id, (name,)].lost += 1
 
     def load(self, now: int) -> float:
         """Return the share of the time up to `now` (ns) in which the bus was occupied: 1.0 is saturated."""
         elapsed = now - self.since
         return self.total.occupied * self._bit / elapsed if elapsed > 0 else 0.0
+
+    def _by_key(self, shown: Callable[[int], int | None]) -> dict[int, Count]:
+        counts: defaultdict[int, Count] = defaultdict(Count)
+        for (key, _), count in self._counts.items():
+            number = shown(key)
+            if number is not None:
+                counts[number].add(count)
+        return dict(counts)
