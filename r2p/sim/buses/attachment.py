@@ -33,8 +33,7 @@ class BusFilter(msgspec.Struct, frozen=True):
 
     def passes(self, frame: Frame | OtherFrame) -> bool:
         """Return whether a frame passes."""
-        extended = type(frame) is Frame or frame.extended  # type: ignore[union-attr]
-        return not (frame.id ^ self.value) & self.mask and self.extended in (None, extended)
+        return not (frame.id ^ self.value) & self.mask and self.extended in (None, frame.extended)
 
 
 class AttachmentOptions(msgspec.Struct, frozen=True, kw_only=True):

@@ -104,7 +104,7 @@ class BusDriver(PluggedNode):
     # From the controller
 
     def _set_callbacks(self, controller: CanController) -> None:
-        controller.on_receive = self._received
+        controller.on_receive = controller.on_other = self._received
         controller.on_sent = self._sent
         controller.on_error = self._given_up
         controller.on_lost = self._lost
@@ -140,7 +140,7 @@ class BusDriver(PluggedNode):
 
     def _next(self) -> None:
         if self.queue and not self.sending:
-            self.sending = self.controller.request(self.queue[0])  # type: ignore[arg-type]
+            self.sending = self.controller.request(self.queue[0])
 
     def _change(self, state: ControllerState, stamp: int) -> None:
         if self._states:
@@ -180,5 +180,5 @@ def node_of(options: AttachmentOptions, name: str) -> CanNode:
 
 
 def _clear_callbacks(controller: CanController) -> None:
-    controller.on_receive = controller.on_sent = controller.on_lost = ignore
+    controller.on_receive = controller.on_other = controller.on_sent = controller.on_lost = ignore
     controller.on_error = controller.on_state = ignore
