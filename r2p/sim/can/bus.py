@@ -68,7 +68,7 @@ class _Transfer(msgspec.Struct, eq=False):
         return [request.owner for request in self.requests]
 
 
-class _Error(msgspec.Struct, eq=False):
+class _ErrorFrame(msgspec.Struct, eq=False):
     """An error frame: what the nodes `by` have detected after these bits on the bus, and the level of their flags.
 
     `unseen`: controllers that only listen do not notice it.
@@ -408,7 +408,7 @@ class CanBus(BusWire):
         end = transfer.start + bits * self.bit
         for request in transfer.requests:
             request.busy_until = end
-        error = _Error(kind, bus, by, "0" if active else "1")
+        error = _ErrorFrame(kind, bus, by, "0" if active else "1")
         if kind is ErrorKind.ACK and not active and transfer.silent:
             self.timeline.at(transfer.start + transfer.bits * self.bit, self._overhear, transfer)
             error.unseen = True
@@ -421,7 +421,7 @@ class CanBus(BusWire):
             if node.concerned(wire_identifier(transfer.frame)):
                 node.receive(transfer.frame, self.timeline.now())
 
-    def _failed(self, transfer: _Transfer, error: _Error) -> None:
+    def _failed(self, transfer: _Transfer, error: _ErrorFrame) -> None:
         now = self.timeline.now()
         sent = {request.owner: request.frame for request in transfer.requests}
         receivers = transfer.receivers
@@ -434,7 +434,7 @@ class CanBus(BusWire):
             if node.on_bus_error is not ignore:
                 self._show_error(transfer, error, node, sent.get(node))
 
-    def _show_error(self, transfer: _Transfer, error: _Error, node: CanController, sent: AnyFrame | None) -> None:
+    def _show_error(self, transfer: _Transfer, error: _ErrorFrame, node: CanController, sent: AnyFrame | None) -> None:
         """Tell a controller of an error frame. If it has not detected the error itself, the error flag is one to it."""
         wire, bit, kind = wire_bits(transfer.frame), len(error.bus), error.kind
         if node not in error.by and sent and error.flag == "0":  # it sees a dominant bit where it sends a recessive one
