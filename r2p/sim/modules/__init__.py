@@ -12,7 +12,7 @@ time, by TCP, or by a pseudo terminal in place of a serial port.
 
 `boards` and `sensors` have the hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...): `r2p.Module`s
 with nodes around a model of `r2p.sim.physics`, on any transport, and the same loader (`boot`). `Plant` advances the
-models. `r2p.sim.robots` assembles modules to robots.
+models. `stamped` has nodes for modules that sample together, and GPS. `r2p.sim.robots` assembles modules to robots.
 """
 
 from r2p.sim.modules.boards import (

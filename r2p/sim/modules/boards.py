@@ -239,7 +239,7 @@ class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
     timeout: float = 0.2
     """Seconds without a setpoint after which the motor stops."""
     encoder: str = "encoder"
-    """Topic of the movement in ticks since the previous message."""
+    """Topic of the movement in ticks since the previous message; none if another node publishes it."""
     period: float = 0.02
     """Period of `encoder`, time-triggered, s."""
     current: str = "current"
@@ -305,8 +305,9 @@ async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
     measure = reopens(lambda period: node.advertise(config.encoder, Encoder, r2p.Periodic(period, moved)))
     doc = "The motor stops when no setpoint has arrived for so long"
     listen(quantity(node, "timeout", config.timeout, (0.02, 10.0), "s", doc, listen).value)
-    doc = "Period of the encoder's messages"
-    measure(quantity(node, "encoder_period", config.period, (0.005, 0.1), "s", doc, measure).value)
+    if config.encoder:
+        doc = "Period of the encoder's messages"
+        measure(quantity(node, "encoder_period", config.period, (0.005, 0.1), "s", doc, measure).value)
     try:
         while True:
             await node.spin()

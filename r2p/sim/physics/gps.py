@@ -125,7 +125,7 @@ class GpsReceiver:
         begins = time + round(late * SECOND)
         if self._sending:  # the line is busy
             begun, before = self._sending[-1]
-            begins = max(begins, begun + self._duration(len(before)))
+            begins = max(begins, begun + self.duration(len(before)))
         self._sending.append((begins, text))
 
     def _fix(self, time: int) -> bytes:
@@ -160,13 +160,14 @@ class GpsReceiver:
         """Hand over the text whose last character has arrived; a UART with DMA does so when the line gets idle."""
         while self._sending:
             begins, text = self._sending[0]
-            if now < begins + self._duration(len(text)):
+            if now < begins + self.duration(len(text)):
                 return
             self._sending.popleft()
             if self.connected:
                 self.on_data(text)
 
-    def _duration(self, characters: int) -> int:
+    def duration(self, characters: int) -> int:
+        """Return how long so many characters take on the line, ns."""
         return characters * _BITS * SECOND // self.spec.baud
 
 

@@ -236,19 +236,19 @@ async def forward_kinematics(
             done = 0
 
 
-async def battery_monitor(node: r2p.Node) -> None:
+async def battery_monitor(node: r2p.Node, spec: BatterySpec = BATTERY) -> None:
     """Estimate the charge (`battery`) from voltage and current (`power`); warn once when it is low."""
     low = node.parameter("low_charge", 20, min=0, max=100, unit="%", doc="A lower charge of the battery is a warning")
     battery = node.advertise("battery", Battery, latch=True)
     current: float | None = None  # A, the mean of the last ten seconds or so
     warned = False
     async for reading in node.subscribe("power", Battery, lossy=True):
-        rest = reading.voltage + reading.current * BATTERY.resistance / 1000  # mV without a load
-        share = (rest / 1000 - BATTERY.empty) / (BATTERY.full - BATTERY.empty)
+        rest = reading.voltage + reading.current * spec.resistance / 1000  # mV without a load
+        share = (rest / 1000 - spec.empty) / (spec.full - spec.empty)
         charge = max(0, min(100, round(share * 100)))
         now = reading.current / 1000
         current = now if current is None else current + (now - current) / 20
-        hours = BATTERY.capacity * charge / 100 / current if current > 0 else math.inf
+        hours = spec.capacity * charge / 100 / current if current > 0 else math.inf
         await battery.publish(Battery(reading.voltage, reading.current, charge, round(min(65535, hours * 60))))
         if charge < low.value and not warned:
             node.log.warning("battery is down to %d %%: %.1f V", charge, reading.voltage / 1000)
