@@ -20,7 +20,6 @@ from r2p.log_lines import NodeLogger
 from r2p.runtime.ticks import Closable
 from r2p.units import SECOND
 
-_REMIND_AFTER = 5 * SECOND  # of waiting for a time that is unknown: twice what a module takes to join a bus
 _LONG_PERIOD = SECOND
 _UTC_STEP = SECOND // 10  # by which UTC may be set before ticks begin anew; less is made up for as by a late loop
 _UTC_LOOK = SECOND // 2  # ns between two looks at UTC, which may be slewed while a tick is waited for
@@ -182,34 +181,28 @@ class NetworkTicker:
     between. While there is no sync, ticks go on by the local clock.
     """
 
-    def __init__(
-        self, space: NetworkClocks, period: int, callback: Callable[[NetworkTick], object], log: NodeLogger
-    ) -> None:
+    def __init__(self, space: NetworkClocks, period: int, callback: Callable[[NetworkTick], object]) -> None:
         self._space = space
         self._period = period
         self._callback = callback
-        self._log = log
         self._clock: NetworkClock | None = None
         self._alarm: ClockAlarm | None = None
         self._run: Hashable = None  # the clock and its run in which ticks are counted
         self._next = 0  # the number of the next tick: its time in periods
         self._last: int | None = None  # when the last one was due (monotonic ns)
         self._resumed = False  # no tick yet since time went on somewhere else
-        self._reminder = Alarm(space.loop, self._remind, background=True)
         # The events of a simulated bus keep no virtual time going, but a tick that is waited for does.
         self._awake = Alarm(space.loop, lambda: None)
 
     def start(self) -> None:
         """Start with the first tick after now."""
         self._space.on_link_added.append(self._corrected)
-        self._reminder.set(self._space.clock.monotonic() + _REMIND_AFTER)
         self._corrected()
 
     def close(self) -> None:
         """Stop the ticks."""
         if self._corrected in self._space.on_link_added:
             self._space.on_link_added.remove(self._corrected)
-        self._reminder.close()
         self._awake.close()
         self._use(None)
 
@@ -252,7 +245,6 @@ class NetworkTicker:
 
     def _begin(self, clock: NetworkClock, time: int) -> None:
         """Count ticks in a time that has just become known, or goes on somewhere else."""
-        self._reminder.close()
         self._run = clock, clock.run
         self._resumed = True
         self._next = time // self._period + 1
@@ -280,16 +272,8 @@ class NetworkTicker:
         self._arm()
         self._callback(NetworkTick(due, 0.0, skipped, scheduled, clock.epoch, clock.aligned))
 
-    def _remind(self) -> None:
-        name = "" if self._clock is None else self._clock.name
-        self._log.warning(
-            "ticks wait for the network time of %s: there is no master on this bus, or it is not known yet", name
-        )
 
-
-async def network_ticks(
-    period: float, space: NetworkClocks, tickers: set[Closable], log: NodeLogger
-) -> AsyncIterator[NetworkTick]:
+async def network_ticks(period: float, space: NetworkClocks, tickers: set[Closable]) -> AsyncIterator[NetworkTick]:
     """Yield a tick at each whole multiple of `period` seconds. The ticker is in `tickers` while it runs."""
     waiter: asyncio.Future[None] | None = None
     pending: NetworkTick | None = None
@@ -302,7 +286,7 @@ async def network_ticks(
         if waiter is not None and not waiter.done():
             waiter.set_result(None)
 
-    ticker = NetworkTicker(space, round(period * SECOND), on_tick, log)
+    ticker = NetworkTicker(space, round(period * SECOND), on_tick)
     tickers.add(ticker)
     ticker.start()
     try:
@@ -322,6 +306,7 @@ class HookOwner(Protocol):
     """The node of a `SyncHook`."""
 
     name: str
+    log: NodeLogger
 
     @property
     def ending(self) -> bool:
@@ -347,6 +332,7 @@ class SyncHook:
         self._node = node
         self._callback = callback
         self._clock: NetworkClock | None = None
+        self._served = False
         self._choose()
         if self._clock is None:
             raise TransportError(
@@ -368,6 +354,11 @@ class SyncHook:
         self._clock = self._space.network_clock()
         if self._clock is not None:
             self._clock.hook(self._on_sync, self._choose)
+            self._served = True
+        elif self._served:
+            self._served = False
+            text = "node %s: no link of this module has syncs any more; on_sync() waits for the next one that has"
+            self._node.log.warning(text, self._node.name)
 
     def _leave(self) -> None:
         if self._clock is not None:

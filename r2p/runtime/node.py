@@ -420,7 +420,7 @@ class Node:
         """
         check_seconds("the period of every()", period, least=SHORTEST)
         if clock == "network":
-            return network_ticks(period, self._space, self._tickers, self.log)
+            return network_ticks(period, self._space, self._tickers)
         if clock != "local":
             raise MessageError(f"the clock of every() is 'local' or 'network', not {clock!r}")
         return ticks(period, self._space.loop, self._space.clock, self._tickers)

@@ -12,7 +12,7 @@ WINDOW = 32
 """Syncs that the line goes through: it has a third of their jitter, and follows a change of drift in 0.3 s."""
 _FEW = 3  # syncs that a new line is taken to go through, also with another master: two tell little about the drift
 _RATE_MAX = 1e-3  # by which two clocks differ, at most: quartzes by 200 ppm, a master that catches up by 260 more
-_STRAY = 10_000  # ns that a sync may be off the line, more than interrupts do; a master's may leave later
+_STRAY = 10_000  # ns that a sync may be off the line besides its usual spread; a master's may leave later, for once
 _STRAYS_MAX = 3  # syncs in a row that may be off before the line is taken to be wrong
 
 
@@ -58,8 +58,9 @@ class NetworkTimeFit:
             return
         expected = self.time(at)
         off = time - expected
-        stray = abs(off) > _STRAY + 4 * self._spread
-        self._spread += (abs(off) - self._spread) / 8
+        usual = _STRAY + 4 * self._spread
+        stray = abs(off) > usual
+        self._spread += (min(abs(off), usual) - self._spread) / 8
         self._strays = self._strays + 1 if stray else 0
         if changed or self._strays > _STRAYS_MAX:
             self._count = min(self._count, _FEW)

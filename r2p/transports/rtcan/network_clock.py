@@ -15,6 +15,9 @@ the last syncs is off by some 2 ppm then, so by a few us.
 """
 
 
+_WAIT = 5 * SECOND  # ns for the first sync, before the user hears of it: twice what a module takes to join a bus
+
+
 class ClockNotice(Protocol):
     """Reports something about the clock to the user."""
 
@@ -31,11 +34,12 @@ class RtcanClock(NetworkClock):
         self._engine = driver.engine
         self._notice = notice
         self._fit = NetworkTimeFit()
-        self._alarm = self._port.alarm(self._coasted)
+        self._alarm = self._port.alarm(self._on_silence)
         self._cycle = self._engine.timing.cycle
         self._counter = 0  # of the last sync
         self._master: int | None = None  # its id8
         self._used = False
+        self._missed = False  # the last notice was that there is no sync
 
     def time(self) -> int | None:
         return self._fit.time(self._driver.now()) if self._fit.known else None
@@ -75,12 +79,19 @@ class RtcanClock(NetworkClock):
             self.epoch = epoch
         self._master = self._engine.network.master
         self._alarm.set(seen.start + COASTING)
-        if not self.aligned:
-            self.aligned = True
-            self._notice("network time", "ticks by network time follow the master again", trouble=False)
+        self.aligned = True
+        if self._missed:
+            self._missed = False
+            self._notice("network time", "there are syncs: ticks by network time follow the master", trouble=False)
         self._corrected()
 
-    def _coasted(self) -> None:
+    def _on_silence(self) -> None:
+        """Report that there was no sync for too long, or none at all so far."""
+        self._missed = True
+        if not self._fit.known:
+            text = "no sync so far, so ticks by network time wait: there is no master on this bus"
+            self._notice("no network time", text, trouble=True)
+            return
         self.aligned = False
         self._engine.counts["network time lost"] += 1
         text = f"no sync for {COASTING // SECOND} s: ticks by network time go on by this module's own clock"
@@ -93,7 +104,6 @@ class RtcanClock(NetworkClock):
             return
         self._used = used
         self._engine.report_syncs(used)
-        if not used:  # the line would be an old one at the next use
-            self._fit = NetworkTimeFit()
-            self._alarm.set(None)
-            self.aligned = True
+        # The line would be an old one at the next use.
+        self._fit, self.aligned, self._missed = NetworkTimeFit(), True, False
+        self._alarm.set(self._driver.now() + _WAIT if used else None)
