@@ -12,6 +12,7 @@ translates the engine's network time to UTC.
 """
 
 import asyncio
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -200,13 +201,13 @@ class EngineDriver:
 class UtcEstimator:
     """Estimates the offset of UTC, by the module's clock, from the network's time.
 
-    Each measurement is off by an unknown delay, so the estimate is the middle of the last ones, and their spread is its
-    possible error.
+    Each measurement is off by an unknown delay, and the two clocks drift: so the estimate is a line through the last
+    measurements, half an interval ahead, and what they are off it is its possible error.
     """
 
     def __init__(self, driver: EngineDriver) -> None:
         self._driver = driver
-        self._measured: deque[int] = deque(maxlen=_MEASUREMENTS)
+        self._measured: deque[tuple[int, int]] = deque(maxlen=_MEASUREMENTS)  # network time, offset
         self._measured_at = -_MEASURE_INTERVAL
         self._offset: ClockOffset | None = None
 
@@ -226,6 +227,18 @@ class UtcEstimator:
             return
         if self._offset is not None and self._offset.epoch != epoch:
             self._measured.clear()  # another run of the network: its time starts anew
-        self._measured.append(self._driver.clock.now() - network_time)
-        low, high = min(self._measured), max(self._measured)
-        self._offset = ClockOffset(epoch, (low + high) // 2, max((high - low + 1) // 2, _UTC_ERROR_MIN))
+        self._measured.append((network_time, self._driver.clock.now() - network_time))
+        offset, error = _extrapolate(self._measured, network_time + _MEASURE_INTERVAL // 2)
+        self._offset = ClockOffset(epoch, offset, max(error, _UTC_ERROR_MIN))
+
+
+def _extrapolate(measured: Sequence[tuple[int, int]], time: int) -> tuple[int, int]:
+    """Return the offset at this time by the line of least squares, and how far off it may be (both ns)."""
+    at, first = measured[-1]
+    points = [(each - at, offset - first) for each, offset in measured]  # small numbers, which floats have exactly
+    middle, mean = (sum(values) / len(points) for values in zip(*points, strict=True))
+    spread = sum((each - middle) ** 2 for each, _ in points)
+    slope = sum((each - middle) * (offset - mean) for each, offset in points) / spread if spread else 0.0
+    widest = max(abs(offset - mean - slope * (each - middle)) for each, offset in points)
+    error = widest + abs(slope) * _MEASURE_INTERVAL / 2
+    return first + round(mean + slope * (time - at - middle)), math.ceil(error)

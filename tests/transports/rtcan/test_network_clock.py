@@ -7,7 +7,7 @@ import itertools
 import logging
 import random
 from contextlib import AsyncExitStack, asynccontextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -325,3 +325,70 @@ async def test_a_coroutine_function_is_no_hook() -> None:
         with pytest.raises(r2p.MessageError, match="'local' or 'network'"):
             node.every(0.1, clock="utc")  # type: ignore[call-overload]
         node.advertise("leds", Led)
+
+
+async def test_a_stamp_in_network_time_is_utc_at_a_pc_behind_a_gateway() -> None:
+    """Of samples that were latched at a sync, and at a tick; all clocks of the bus are wrong, each in another way."""
+    made, lan = Lab(), "memory:lan?delay=0.003"
+    latency = Latency(LATENCY, 1_000)
+    master: dict[str, Any] = {"offset": 7 * SECOND, "drift_ppm": 100.0, "transmit": latency, "receive": latency}
+    sensor: dict[str, Any] = {"offset": 3 * SECOND, "drift_ppm": -100.0, "transmit": latency, "receive": latency}
+    bus = made.can.transport(drift_ppm=50.0, offset=SECOND, receive=latency)
+    true: dict[int, int] = {}
+
+    async def sample(node: r2p.Node) -> None:
+        stamps = node.advertise("stamps", r2p.Timestamp)
+        latched: list[r2p.Sync] = []
+
+        def latch(sync: r2p.Sync) -> None:
+            true[sync.time] = clock_of().now() - LATENCY
+            latched[:] = [sync]
+
+        node.on_sync(latch)
+        async for tick in node.every(0.1, clock="network"):
+            true[tick.time] = clock_of().now()
+            await stamps.publish(r2p.Timestamp.from_ns(tick.time))
+            await stamps.publish(r2p.Timestamp.from_ns(latched[0].time))
+
+    async with (
+        made.module("MASTER", options={"priority": 9}, **master),
+        made.module("SENSOR", **sensor),
+        r2p.Module("GW", via=[bus, lan], bridge=True),
+        r2p.Module("PC", via=lan) as pc,
+        node_in(pc) as laptop,
+    ):
+        made.host("SENSOR").start(sample)
+        subscriber = laptop.subscribe("stamps", r2p.Timestamp, queue=100)
+        seen, epochs = 0, set()
+        async for found in subscriber.samples():
+            if found.clock is None or laptop.now() < 1_356_998_400 * SECOND + 15 * SECOND:
+                continue  # the gateway has not measured it yet
+            time = found.message.ns
+            assert 1_000 <= found.clock.error < 20_000
+            assert abs(found.clock.utc(time) - true[time]) <= found.clock.error + 5_000
+            epochs.add(found.clock.epoch)
+            seen += 1
+            if seen == 40:
+                break
+        assert len(epochs) == 1
+
+
+async def test_of_several_buses_the_first_one_s_time_counts() -> None:
+    """Its syncs, too; the other bus has another master and another time."""
+    first, second = Lab(), Lab()
+    board = Board("GW")
+    latency = Latency(LATENCY)
+    node: dict[str, Any] = {"transmit": latency, "receive": latency}
+    async with first.module("A", options={"priority": 9}, **node), second.module("B", options={"priority": 9}, **node):
+        await asyncio.sleep(0.7777)
+        links = [first.can.transport(**node), second.can.transport(offset=5_000, **node)]
+        async with r2p.Module("GW", via=links, watchdog=False) as gateway:
+            gateway.start(board.run)
+            await until(lambda: len(board.ticks) > 50)
+            other = Board("A")
+            first.host("A").start(other.run)
+            await until(lambda: len(other.ticks) > 50)
+            assert {epoch for epoch, _ in board.ticks} == {first.link("A").engine.network.epoch}
+            assert misalignment(ticks_of([board, other]), 50) < 300
+            assert misalignment(syncs_of([board, other]), 50) == 0
+            assert gateway.links[1].network_clock() is not None  # it is there for whoever asks, and costs nothing
