@@ -12,7 +12,7 @@ from r2p.bridge.options import Policy
 from r2p.clock import Clock
 from r2p.codecs import own_services
 from r2p.codecs.management import DENIED_CONTROL, DENIED_READ_ONLY
-from r2p.codecs.own_services import OwnCall
+from r2p.codecs.own_services import MESSAGE_MAX, OwnCall
 from r2p.codecs.services import Kind
 from r2p.log_lines import get_logger
 from r2p.protocols.discovery.events import ModuleInfo
@@ -58,6 +58,8 @@ class CallRelay:
                 port.count_dropped("call without route")
         elif call.hops >= HOPS_MAX:
             port.count_dropped("too many hops")
+        elif len(data) > MESSAGE_MAX:  # only asked for where no gateway is on the way
+            port.count_dropped("call too long")
         elif refusal := self._refusal(port, target, call):
             self._refuse(port, call, refusal, source)
         else:

@@ -1,6 +1,7 @@
 """The messages of r2p's own services (PROTOCOL.md 9): calls from one module to another, known without announcements.
 
-A request travels on the topic `R2P_CALL`, its answer on `R2P_REPLY`. Both have at most 200 bytes, and begin alike:
+A request travels on the topic `R2P_CALL`, its answer on `R2P_REPLY`. Both have at most 200 bytes, but for answers with
+several pages, which have `ANSWER_MAX` at most. They begin alike:
 
 | bytes | content |
 | --- | --- |
@@ -8,9 +9,9 @@ A request travels on the topic `R2P_CALL`, its answer on `R2P_REPLY`. Both have 
 | 12 | `u8 hops`: gateways that the message has crossed |
 | 13 | `u8 operation`; from 128 on, those that change something |
 | 14..15 | `u16 page` that is wanted, or answered |
-| 16..17 | `u16 pages`: how many there are; 0 in a request |
+| 16..17 | `u16 pages`: how many there are; in a request: how many the answer may have, 0 as 1 |
 | 18..19 | `u16 edition` of the content, which all its pages share; 0 in a request for the first page |
-| the rest | of a request: its argument; of a response: the page; of an error: its text |
+| the rest | of a request: its argument; of a response: the page, and those after it; of an error: its text |
 """
 
 import enum
@@ -44,6 +45,12 @@ _HOPS = slice(HEADER_SIZE, HEADER_SIZE + 1)
 
 PAGE_MAX = MESSAGE_MAX - _SIZE
 """Bytes of an argument, of a page, or of the text of an error."""
+
+PAGES_AT_ONCE_MAX = 8
+"""Pages that one answer has, on links that carry messages of any length: their rate lets so many go at once."""
+
+ANSWER_MAX = _SIZE + PAGES_AT_ONCE_MAX * PAGE_MAX
+"""Bytes of such an answer."""
 
 _TO_SERVER = (Kind.REQUEST, Kind.CANCEL)
 _KIND = 6  # in the header
@@ -99,18 +106,25 @@ class OwnCall(msgspec.Struct, frozen=True, gc=False):
         return self.operation >= CHANGES
 
 
+def page_count(body: bytes) -> int:
+    """Return how many pages an answer has; an empty one is a page, too."""
+    return max(1, -(-len(body) // PAGE_MAX))
+
+
 def encode(call: OwnCall) -> bytes:
-    """Encode a message. Raises MessageError for more than `PAGE_MAX` bytes."""
-    if len(call.body) > PAGE_MAX:
-        raise MessageError(f"a message of r2p's own services carries {PAGE_MAX} bytes, not {len(call.body)}")
+    """Encode a message. Raises MessageError for more bytes than it carries."""
+    most = PAGE_MAX * (PAGES_AT_ONCE_MAX if call.header.kind is Kind.RESPONSE else 1)
+    if len(call.body) > most:
+        raise MessageError(f"a message of r2p's own services carries {most} bytes, not {len(call.body)}")
     head = _HEAD.pack(call.hops, call.operation, call.page, call.pages, call.edition)
     return services.encode(call.header, head + call.body)
 
 
 def decode(data: bytes) -> OwnCall:
     """Decode a message. Raises DecodeError, UnknownType for one of another kind or version."""
-    if not _SIZE <= len(data) <= MESSAGE_MAX:
-        raise DecodeError(f"a message of r2p's own services has {_SIZE} to {MESSAGE_MAX} bytes, not {len(data)}")
+    most = ANSWER_MAX if len(data) > _KIND and data[_KIND] == Kind.RESPONSE else MESSAGE_MAX
+    if not _SIZE <= len(data) <= most:
+        raise DecodeError(f"a message of r2p's own services has {_SIZE} to {most} bytes, not {len(data)}")
     header = services.decode(data)
     hops, operation, page, pages, edition = _HEAD.unpack_from(data, HEADER_SIZE)
     return OwnCall(header, operation, page, pages, edition, bytes(data[_SIZE:]), hops)

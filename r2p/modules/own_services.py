@@ -5,7 +5,8 @@
 
 Messages are those of `r2p.codecs.own_services`. A request is addressed to the instance of a module, and gateways pass
 it on (`r2p.bridge.calls`). It is repeated until it is answered; a repeated one gets the same answer again. A content
-that does not fit a message is kept until its caller has fetched all pages of it. While a handler that takes time runs,
+that does not fit a message is kept until its caller has fetched all pages of it: one after the other, or many at once
+on links that carry messages of any length. While a handler that takes time runs,
 repetitions get WORKING, and its caller waits.
 
 Operations from `CHANGES` on change something. They need permission (`_refusal`) and run once for each call, however
@@ -20,7 +21,17 @@ import msgspec
 
 from r2p.bridge.calls import CallRelay, permission_text
 from r2p.codecs import UnknownType, own_services, services
-from r2p.codecs.own_services import EDITIONS, PAGE_MAX, PAGES_MAX, WIRE_MIN, Operation, OwnCall
+from r2p.codecs.own_services import (
+    ANSWER_MAX,
+    EDITIONS,
+    PAGE_MAX,
+    PAGES_AT_ONCE_MAX,
+    PAGES_MAX,
+    WIRE_MIN,
+    Operation,
+    OwnCall,
+    page_count,
+)
 from r2p.codecs.services import NUMBERS, Kind, ServiceHeader
 from r2p.errors import DecodeError, Error, ServiceError
 from r2p.log_lines import LineLimit, get_logger
@@ -85,10 +96,10 @@ class _Content(msgspec.Struct, frozen=True):
 
     @property
     def pages(self) -> int:
-        return max(1, -(-len(self.data) // PAGE_MAX))
+        return page_count(self.data)
 
-    def page(self, number: int) -> bytes:
-        return self.data[number * PAGE_MAX : (number + 1) * PAGE_MAX]
+    def part(self, page: int, count: int) -> bytes:
+        return self.data[page * PAGE_MAX : (page + count) * PAGE_MAX]
 
 
 class OwnServices:
@@ -178,13 +189,14 @@ class OwnServices:
             raise ServiceError(services.decode_text(first.body) or "the module answers with an error")
         if first.pages > PAGES_MAX:
             raise ServiceError(f"an answer of {first.pages} pages, more than {PAGES_MAX}")
-        pages = [first.body]
-        for page in range(1, first.pages):
+        parts, page = [first.body], page_count(first.body)
+        while page < first.pages:
             call = await self._ask(instance, operation, argument, page, first.edition)
             if call.header.kind is not Kind.RESPONSE or call.edition != first.edition:
                 return None
-            pages.append(call.body)
-        return b"".join(pages)
+            parts.append(call.body)
+            page += page_count(call.body)
+        return b"".join(parts)
 
     async def _ask(
         self, instance: int, operation: Operation, argument: bytes, page: int = 0, edition: int = 0
@@ -192,7 +204,9 @@ class OwnServices:
         """Send a request, again and again, until it is answered. Raises TimeoutError."""
         header = ServiceHeader(self._instance, self._next_number(), Kind.REQUEST, instance)
         question = _Question(header, operation, page, self._space.loop.create_future())
-        request = own_services.encode(OwnCall(header, operation, page, 0, edition, argument))
+        nearest = self._nearest(instance)
+        at_once = 0 if nearest is None or nearest[1].hops else _pages_at_once(nearest[0])
+        request = own_services.encode(OwnCall(header, operation, page, at_once, edition, argument))
         self._questions[header.number] = question
         try:
             await self._repeat(request, question)
@@ -313,10 +327,10 @@ class OwnServices:
         """Return the answer to a request; None if a task makes it."""
         try:
             if call.page:
-                return self._page(call, self._kept(call))
+                return self._page(link, call, self._kept(call))
             made = self._handler(call.operation)(call.body)
             if isinstance(made, bytes):
-                return self._page(call, self._keep(call, made))
+                return self._page(link, call, self._keep(call, made))
             if self.tasks is None or len(self._running) >= _RUNNING_MAX:
                 made.close()
                 raise ServiceError(f"{self._space.module} {'is busy' if self.tasks else 'ends'}: try again later")
@@ -331,7 +345,8 @@ class OwnServices:
     async def _work(self, call: OwnCall, running: _Running, making: Coroutine[Any, Any, bytes]) -> None:
         """Answer a request when its handler has ended, by the link by which it was repeated last."""
         try:
-            answer = self._page(call, self._keep(call, await making))
+            content = self._keep(call, await making)
+            answer = self._page(running.link, call, content)
         except asyncio.CancelledError:
             if self.tasks is None:
                 raise  # the module ends
@@ -386,11 +401,12 @@ class OwnServices:
         link.stats.lost.internal_error(error)
         return self._reply(call, Kind.ERROR, b"internal error: the log of the module has it")
 
-    def _page(self, call: OwnCall, content: _Content) -> bytes:
-        """Return the answer with the page that a request wants."""
+    def _page(self, link: Link, call: OwnCall, content: _Content) -> bytes:
+        """Return the answer with the page that a request wants, and those after it that it and the link take."""
         if call.page >= content.pages:
             return self._reply(call, Kind.ERROR, b"no such page")
-        return self._reply(call, Kind.RESPONSE, content.page(call.page), content)
+        count = min(max(1, call.pages), max(1, _pages_at_once(link)))
+        return self._reply(call, Kind.RESPONSE, content.part(call.page, count), content)
 
     def _kept(self, call: OwnCall) -> _Content:
         """Return the content that a caller has begun to fetch."""
@@ -423,6 +439,11 @@ class OwnServices:
         header = ServiceHeader(call.header.instance, call.header.number, kind, self._instance)
         pages, edition = (0, 0) if content is None else (content.pages, content.edition)
         return own_services.encode(OwnCall(header, call.operation, call.page, pages, edition, body))
+
+
+def _pages_at_once(link: Link) -> int:
+    """Return how many pages one answer may have on a link; 0: as every link carries it."""
+    return PAGES_AT_ONCE_MAX if link.max_payload >= ANSWER_MAX else 0
 
 
 def unknown_operation(operation: int) -> str:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from r2p.codecs import UnknownType, call_parts, debug, management, own_services
 from r2p.codecs.call_parts import CallPart
-from r2p.codecs.own_services import MESSAGE_MAX, PAGE_MAX, Operation, OwnCall
+from r2p.codecs.own_services import ANSWER_MAX, MESSAGE_MAX, PAGE_MAX, Operation, OwnCall
 from r2p.codecs.services import Kind, ServiceHeader
 from r2p.errors import DecodeError, MessageError
 from r2p.protocols.call_parts import CallAssembler
@@ -57,6 +57,13 @@ def test_whatever_may_change_something_needs_a_seal(data: bytes) -> None:
 def test_a_message_that_does_not_fit() -> None:
     with pytest.raises(MessageError, match="carries 180 bytes, not 181"):
         own_services.encode(OwnCall(QUESTION.header, 1, body=bytes(181)))
+    response = OwnCall(ServiceHeader(1, 2, Kind.RESPONSE, 3), 1, body=bytes(8 * PAGE_MAX))
+    assert own_services.decode(own_services.encode(response)) == response
+    assert len(own_services.encode(response)) == ANSWER_MAX
+    with pytest.raises(MessageError, match="carries 1440 bytes, not 1441"):
+        own_services.encode(OwnCall(response.header, 1, body=bytes(1441)))
+    with pytest.raises(DecodeError, match="20 to 200 bytes, not 1460"):
+        own_services.decode(own_services.encode(response)[:6] + bytes((Kind.ERROR,)) + bytes(ANSWER_MAX - 7))
 
 
 @given(st.binary(max_size=2 * MESSAGE_MAX))

@@ -168,7 +168,10 @@ async def test_a_module_works_on_64_requests_at_most() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_an_answer_that_is_forgotten_before_its_last_page_is_no_reason_to_change_it_again() -> None:
+async def test_an_answer_that_is_forgotten_before_its_last_page_is_no_reason_to_change_it_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("r2p.modules.own_services._pages_at_once", lambda _link: 1)
     network = MemoryNetwork(delay=0.001)
     async with two(network) as (desk, a, b):
         asyncio.get_running_loop().call_later(0.005, services(a)._contents.clear)
