@@ -10,7 +10,7 @@ import pytest
 from r2p.codecs.can_bits import EXTENDED, IDENTIFIER_MASK, AnyFrame, Frame, FrameField, OtherFrame, field_at, wire_bits
 from r2p.codecs.rtcan import encode_identifier
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, FrameRecord
-from r2p.sim.can.bus import bits_until_noticed, error_frame_bits, first_difference, flip
+from r2p.sim.can.error_frames import bits_until_noticed, error_frame_bits, first_difference, flip
 from tests import can_watch
 
 BIT = 1000  # ns at 1 Mbit/s

@@ -12,8 +12,8 @@ events keep their exact instants on the bus, and run as soon as the loop gets to
 Work is done per frame, not per bit: the winner of an arbitration is the lowest of a few integers, and the codec counts
 (and caches) the length of its frame. The same seed gives the same run: each node has its own random numbers.
 
-Read `records` first (settings, and what is recorded), then `bus` (arbitration, frames, error frames), `controller`
-(mailboxes, callbacks, error counters) and `timeline` (events and clocks).
+Read `records` first (settings, and what is recorded), then `bus` (arbitration and frames) with `error_frames` and
+`participants`, `controller` (mailboxes, callbacks, error counters) and `timeline` (events and clocks).
 """
 
 from r2p.sim.can.bus import CanBus

@@ -8,12 +8,11 @@ the frame, which is the next event. So a frame is two events here, and one for e
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
 from r2p.codecs.can_bits import (
-    EXTENDED,
     INTERMISSION,
     TAIL,
     Frame,
@@ -24,7 +23,16 @@ from r2p.codecs.can_bits import (
     wire_bits,
     wire_identifier,
 )
-from r2p.sim.can.controller import RECESSIVE_BITS, BusWire, CanController, ignore
+from r2p.sim.can.controller import BusWire, CanController, ignore
+from r2p.sim.can.error_frames import (
+    Disturbance,
+    ErrorFrame,
+    bits_until_noticed,
+    error_frame_bits,
+    first_difference,
+    flip,
+)
+from r2p.sim.can.participants import Listeners, Recovery
 from r2p.sim.can.records import ArbitrationLoss, BusError, CanNode, ControllerState, ErrorKind, FrameRecord, Statistics
 from r2p.sim.can.timeline import Timeline
 from r2p.units import NEVER, SECOND
@@ -36,16 +44,9 @@ if TYPE_CHECKING:
     from r2p.codecs.can_bits import AnyFrame
     from r2p.sim.can.controller import ControllerMailboxes, TransmitRequest
 
-_FLAG: Final = 6  # bits of an error flag
-_DELIMITER: Final = 8  # recessive bits that end an error frame
 _SUSPEND: Final = 8  # bits that an error passive sender waits longer before its next frame
 _BITS_AFTER_ACK: Final = TAIL - 2  # bits that follow the acknowledge slot
 _BITS_AFTER_ACK_DELIMITER: Final = TAIL - 3  # by then, receivers have compared the CRC
-_RECOVERY_SEQUENCES: Final = 128  # times 11 recessive bits, until a controller leaves bus-off
-_CACHED_MAX: Final = 4096  # identifiers for which it is known which controllers they concern
-
-K = TypeVar("K")
-V = TypeVar("V")
 
 
 class _Transfer(msgspec.Struct, eq=False):
@@ -66,34 +67,6 @@ class _Transfer(msgspec.Struct, eq=False):
     @property
     def owners(self) -> list[CanController]:
         return [request.owner for request in self.requests]
-
-
-class _ErrorFrame(msgspec.Struct, eq=False):
-    """An error frame: what the nodes `by` have detected after these bits on the bus, and the level of their flags.
-
-    `unseen`: controllers that only listen do not notice it.
-    """
-
-    kind: ErrorKind
-    bus: str
-    by: Sequence[CanController]
-    flag: str
-    unseen: bool = False
-
-
-class _Disturbance(msgspec.Struct, eq=False):
-    """Bit errors to come: `count` frames of this identifier and sender, if given, lose this bit, or a random one."""
-
-    bit: int | None
-    count: int
-    identifier: int | None
-    sender: str | None
-
-    def hits(self, transfer: _Transfer) -> bool:
-        """Return whether this frame is one of them."""
-        return (self.sender is None or self.sender in transfer.names) and (
-            self.identifier is None or self.identifier == wire_identifier(transfer.frame)
-        )
 
 
 class CanBus(BusWire):
@@ -125,7 +98,7 @@ class CanBus(BusWire):
         self._names: set[str] = set()
         self._listeners = Listeners()
         self._noisy = False  # whether a node has noise of its own
-        self._disturbances: list[_Disturbance] = []
+        self._disturbances: list[Disturbance] = []
         self._free = 0  # from when on a frame may start
         self._contenders: dict[ControllerMailboxes, None] = {}  # all that may have something to send, in order
         self._start: int | None = None  # of the next frame
@@ -160,7 +133,7 @@ class CanBus(BusWire):
         frame that more than one waits for, the first counts.
         """
         if count > 0:
-            self._disturbances.append(_Disturbance(bit, count, identifier, sender))
+            self._disturbances.append(Disturbance(bit, count, identifier, sender))
 
     def load(self) -> float:
         """Return the share of the time that the bus was occupied since the start or `reset_statistics`."""
@@ -366,7 +339,7 @@ class CanBus(BusWire):
     def _disturbed(self, transfer: _Transfer) -> tuple[bool, int | None]:
         """Return whether a disturbance waits for this frame, and its bit."""
         for each in self._disturbances:
-            if each.hits(transfer):
+            if each.hits(transfer.frame, transfer.names):
                 each.count -= 1
                 if not each.count:
                     self._disturbances.remove(each)
@@ -408,7 +381,7 @@ class CanBus(BusWire):
         end = transfer.start + bits * self.bit
         for request in transfer.requests:
             request.busy_until = end
-        error = _ErrorFrame(kind, bus, by, "0" if active else "1")
+        error = ErrorFrame(kind, bus, by, "0" if active else "1")
         if kind is ErrorKind.ACK and not active and transfer.silent:
             self.timeline.at(transfer.start + transfer.bits * self.bit, self._overhear, transfer)
             error.unseen = True
@@ -421,7 +394,7 @@ class CanBus(BusWire):
             if node.concerned(wire_identifier(transfer.frame)):
                 node.receive(transfer.frame, self.timeline.now())
 
-    def _failed(self, transfer: _Transfer, error: _ErrorFrame) -> None:
+    def _failed(self, transfer: _Transfer, error: ErrorFrame) -> None:
         now = self.timeline.now()
         sent = {request.owner: request.frame for request in transfer.requests}
         receivers = transfer.receivers
@@ -434,7 +407,7 @@ class CanBus(BusWire):
             if node.on_bus_error is not ignore:
                 self._show_error(transfer, error, node, sent.get(node))
 
-    def _show_error(self, transfer: _Transfer, error: _ErrorFrame, node: CanController, sent: AnyFrame | None) -> None:
+    def _show_error(self, transfer: _Transfer, error: ErrorFrame, node: CanController, sent: AnyFrame | None) -> None:
         """Tell a controller of an error frame. If it has not detected the error itself, the error flag is one to it."""
         wire, bit, kind = wire_bits(transfer.frame), len(error.bus), error.kind
         if node not in error.by and sent and error.flag == "0":  # it sees a dominant bit where it sends a recessive one
@@ -460,131 +433,3 @@ class CanBus(BusWire):
             self._destroy(transfer, bus, ErrorKind.STUFF, transfer.receivers)
         elif transfer.requests and not transfer.receivers and sent < transfer.bits - _BITS_AFTER_ACK:
             self._destroy(transfer, wire[:-_BITS_AFTER_ACK], ErrorKind.ACK, transfer.owners)
-
-
-class Listeners:
-    """The live controllers in the order of their connection, and two caches: used for each frame, seldom changed."""
-
-    def __init__(self) -> None:
-        self.live: list[CanController] = []
-        """Those that acknowledge frames."""
-        self.silent: list[CanController] = []
-        """Those that only listen."""
-        self.audience = _Cache(self._find_audience)
-        """By controller: its name, and the receivers and the silent listeners of frames that it sends alone."""
-        self.concerned = _Cache(self._find_concerned)
-        """The controllers that a good frame concerns; by the id of a `Frame`, by ~`wire_identifier` of others."""
-
-    def join(self, controller: CanController) -> None:
-        (self.silent if controller.node.listen_only else self.live).append(controller)
-        self.audience.clear()
-        self.concerned.clear()
-
-    def leave(self, controller: CanController) -> None:
-        for controllers in (self.live, self.silent):
-            if controller in controllers:
-                controllers.remove(controller)
-                self.audience.clear()
-                self.concerned.clear()
-
-    def _find_audience(self, owner: CanController) -> tuple[tuple[str, ...], list[CanController], list[CanController]]:
-        return (owner.name,), [each for each in self.live if each is not owner], self.silent.copy()
-
-    def _find_concerned(self, key: int) -> list[CanController]:
-        identifier = key | EXTENDED if key >= 0 else ~key
-        return [each for each in (*self.live, *self.silent) if each.concerned(identifier)]
-
-
-class _Cache(dict[K, V]):
-    """Values that are found at the first look-up; a look-up costs no call after that, which counts for each frame."""
-
-    def __init__(self, find: Callable[[K], V]) -> None:
-        super().__init__()
-        self._find = find
-
-    def __missing__(self, key: K) -> V:
-        if len(self) >= _CACHED_MAX:
-            self.clear()
-        value = self[key] = self._find(key)
-        return value
-
-
-class Recovery:
-    """The controllers that are on their way out of bus-off: each counts 128 times 11 recessive bits in a row."""
-
-    def __init__(self, timeline: Timeline, bit: int) -> None:
-        self._timeline = timeline
-        self._sequence = RECESSIVE_BITS * bit  # ns
-        self.remaining: dict[CanController, int] = {}
-        """Sequences that are left to count; while this is empty, `busy` and `free` need not be called."""
-        self._since: dict[CanController, int] = {}  # from when on the bus was idle
-        self._idle = 0  # counts changes between busy and idle: a timer from before a change does nothing
-
-    def begin(self, controller: CanController, since: int) -> None:
-        """Let this controller count from `since`, when the bus is idle."""
-        if not self.remaining:
-            self._idle += 1  # `busy` and `free` were not called, so older timers are void
-        self.remaining[controller] = _RECOVERY_SEQUENCES
-        self._since[controller] = since
-        self._wait(controller)
-
-    def forget(self, controller: CanController) -> None:
-        self.remaining.pop(controller, None)
-
-    def busy(self, start: int) -> None:
-        """Count the sequences up to the start of a frame."""
-        self._idle += 1
-        for controller in self.remaining:
-            self.remaining[controller] -= max(0, start - self._since[controller]) // self._sequence
-
-    def free(self, since: int) -> None:
-        """Go on to count after a frame or an error frame, whose intermission ends at `since`."""
-        self._idle += 1
-        for controller in self.remaining:
-            if self._since[controller] < since:  # the end of a frame and its intermission are one sequence
-                self.remaining[controller] -= 1
-            self._since[controller] = max(since, self._since[controller])
-            self._wait(controller)
-
-    def _wait(self, controller: CanController) -> None:
-        when = self._since[controller] + max(0, self.remaining[controller]) * self._sequence
-        self._timeline.at(when, self._check, controller, self._idle)
-
-    def _check(self, controller: CanController, idle: int) -> None:
-        if idle == self._idle and self.remaining.pop(controller, None) is not None:
-            controller.rejoin()
-
-
-# Error frames, bit by bit: slow, but needed only when an error happens.
-#
-# An error active node answers an error with an active error flag, 6 dominant bits. The other nodes notice the error
-# when the flag breaks a rule of theirs - a sixth equal bit, or a dominant one after the CRC - and send their own flags:
-# one to twelve bits of flags in all. The flag of an error passive node is recessive, so the others see it only if that
-# node was the sender, which falls silent. 8 recessive bits, the delimiter, end the error frame.
-
-
-def flip(wire: str, bit: int) -> str:
-    """Return the bus up to bit `bit`, counted from 1, with that bit inverted."""
-    return wire[: bit - 1] + ("1" if wire[bit - 1] == "0" else "0")
-
-
-def first_difference(wires: Sequence[str]) -> int:
-    """Return the number, counted from 1, of the first bit in which senders of one identifier differ."""
-    return next(number for number, bits in enumerate(zip(*wires, strict=False), start=1) if len(set(bits)) > 1)
-
-
-def error_frame_bits(bus: str, wire: str, *, active: bool, others: bool) -> int:
-    """Return the bits from the detection of an error to the end of the error frame.
-
-    `bus`: the levels so far; `wire`: the whole frame as its sender wanted it. `active`: a node that detected the error
-    is error active; `others`: a node that has yet to notice it is.
-    """
-    noticed = bits_until_noticed(bus, wire, "0" if active else "1") if others else 0
-    return noticed + _FLAG + _DELIMITER
-
-
-def bits_until_noticed(bus: str, wire: str, level: str) -> int:
-    """Return how many more bits of this level must follow `bus` until every node has noticed the error."""
-    if len(bus) >= len(wire) - TAIL:
-        return 1
-    return max(0, _FLAG - (len(bus) - len(bus.rstrip(level))))
