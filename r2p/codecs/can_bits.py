@@ -88,6 +88,11 @@ class FrameField(IntEnum):
     INTERMISSION = 0x12
 
 
+ARBITRATION_FIELDS = {*list(FrameField)[1:4], FrameField.ID_17_TO_13, FrameField.ID_12_TO_5, FrameField.ID_4_TO_0}
+ARBITRATION_FIELDS |= {FrameField.EXTENSION, FrameField.REMOTE}
+"""Where a controller that sends a recessive bit and sees a dominant one loses the arbitration."""
+
+
 def frame_bits_min(size: int) -> int:
     """Return the bits of the shortest frame with `size` bytes of data: no stuff bits. Without intermission."""
     return _HEADER + 8 * size + _CRC + TAIL

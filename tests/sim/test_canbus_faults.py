@@ -759,3 +759,168 @@ async def test_a_good_frame_takes_the_receive_counter_back_below_passive() -> No
     a.request(FRAME)
     await asyncio.sleep(0.001)
     assert (b.confinement.receive, b.state) == (119, ControllerState.ACTIVE)
+
+
+# A bus that is stuck at dominant
+
+
+@pytest.mark.virtual_time
+async def test_a_short_circuit_of_a_free_bus() -> None:
+    watch = Watch()
+    a, b, ear = watch.attach("A"), watch.attach("B"), watch.attach("ear", listen_only=True)
+    await at(watch, 1_000_000)
+    watch.bus.short(50 * BIT)
+    a.request(FRAME)
+    await asyncio.sleep(0.01)
+    first, second = watch.records
+    # 6 dominant bits are an error, the flags take 6 more, and only after the short the delimiter begins
+    assert first == FrameRecord(1_000_000, 1_000_000 + 58 * BIT, OtherFrame(0), (), 50 + DELIMITER, ErrorKind.STUFF)
+    assert (second.start, second.frame, second.error) == (first.end + GAP, FRAME, None)
+    # 1 for the error, 8 for the first dominant bit after the flag, and 8 for each 8 that follow: 38 = 4 * 8 + 6
+    assert [(each.transmit_errors, each.receive_errors) for each in (a, b, ear)] == [(0, 41), (0, 40), (0, 0)]
+    assert {error.bit for _, error, _ in watch.errors} == {6}
+    assert watch.bus.statistics.total.error_bits == 58
+
+
+@pytest.mark.virtual_time
+async def test_a_glitch_is_a_start_of_frame_without_a_frame() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    watch.bus.short(1)
+    await asyncio.sleep(0.001)
+    assert [(record.bits, record.error) for record in watch.records] == [(1 + 6 + 6 + DELIMITER, ErrorKind.STUFF)]
+    assert [counters(each) for each in (a, b)] == [(0, 1), (0, 1)]
+
+
+@pytest.mark.virtual_time
+async def test_a_long_short_circuit_takes_the_sender_to_bus_off_and_the_others_to_error_passive() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    a.request(FRAME)
+    await at(watch, 60 * BIT)
+    watch.bus.short(1_000_000_000)
+    a.request(OTHER, 1)
+    await asyncio.sleep(0.9)
+    assert a.state is ControllerState.BUS_OFF
+    assert (b.state, b.transmit_errors, b.receive_errors) == (ControllerState.PASSIVE, 0, 129)
+    (off,) = [stamp for name, state, stamp in watch.of("state") if (name, state) == ("A", ControllerState.BUS_OFF)]
+    error = watch.errors[0][1]
+    # after its flag of 6 bits, 31 times 8 more dominant bits: 8 + 31 * 8 = 256; the flag of B begins up to 6 bits later
+    assert 0 <= off // BIT - (error.bit + 6 + 31 * 8) <= 6
+    assert not watch.records
+    await asyncio.sleep(0.2)
+    (record,) = watch.records
+    assert record.end == (60 + 1_000_000 + DELIMITER) * BIT
+    assert watch.of("state")[-1] == ("A", ControllerState.ACTIVE, record.end + GAP + 127 * SEQUENCE)
+
+
+@pytest.mark.virtual_time
+async def test_a_short_circuit_in_the_arbitration_field_wins_the_arbitration() -> None:
+    watch = Watch()
+    a, b = watch.attach("A", one_shot=True), watch.attach("B")
+    frame = OtherFrame(0x155, b"x")
+    a.request(frame)
+    await at(watch, 5 * BIT)
+    watch.bus.short(30 * BIT)
+    await asyncio.sleep(0.001)
+    assert watch.of("lost") == [("A", frame, 6 * BIT)]  # 0 0010 1: the first recessive bit that is overwritten
+    assert [error for _, error in watch.outcomes] == [ErrorKind.STUFF]
+    assert a.transmit_errors == 0
+    assert a.receive_errors == b.receive_errors > 8
+
+
+@pytest.mark.virtual_time
+async def test_a_short_circuit_that_overwrites_no_recessive_bit_is_harmless() -> None:
+    watch = Watch()
+    a, _ = watch.attach("A"), watch.attach("B")
+    frame = Frame(0, bytes(8))
+    wire = wire_bits(frame)
+    a.request(frame)
+    await at(watch, wire.index("000", 50) * BIT)
+    watch.bus.short(2 * BIT)
+    await asyncio.sleep(0.001)
+    assert watch.outcomes == [(frame, None)]
+
+
+# A node whose wire is cut
+
+
+@pytest.mark.virtual_time
+async def test_a_node_whose_wire_is_cut_tries_for_ever_and_is_heard_when_it_is_mended() -> None:
+    watch = Watch()
+    a, b, _ = (watch.attach(name) for name in "ABC")
+    b.cut_wire()
+    b.cut_wire()
+    b.request(OTHER)
+    a.request(FRAME)
+    await asyncio.sleep(0.1)
+    assert watch.outcomes == [(FRAME, None)]
+    assert [name for name, *_ in watch.of("received")] == ["C"]
+    assert (b.state, b.transmit_errors) == (ControllerState.PASSIVE, 128)
+    assert b.pending() is OTHER
+    b.mend_wire()
+    b.mend_wire()
+    await asyncio.sleep(0.01)
+    assert watch.outcomes == [(FRAME, None), (OTHER, None)]
+    assert watch.records[1].start == 100_000_000 + SEQUENCE
+    assert b.transmit_errors == 127
+    a.request(FRAME)
+    await asyncio.sleep(0.01)
+    assert {name for name, *_ in watch.of("received")[-2:]} == {"B", "C"}
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(("left", "seen"), [(60, ErrorKind.ACK), (9, ErrorKind.ACK), (8, None), (1, None)])
+async def test_a_sender_is_cut_off_in_the_middle_of_its_frame(left: int, seen: ErrorKind | None) -> None:
+    """To the others it falls silent, and it misses their acknowledge, or has it already."""
+    watch = Watch()
+    a, b = watch.attach("A", one_shot=True), watch.attach("B")
+    a.request(FRAME)
+    await at(watch, (bits(FRAME) - left) * BIT)
+    a.cut_wire()
+    await asyncio.sleep(0.001)
+    assert [kind for _, _, kind, _ in watch.of("error")] == ([seen] if seen else [])
+    assert [stamp for *_, stamp in watch.of("sent")] == ([] if seen else [bits(FRAME) * BIT])
+    assert [error for _, error in watch.outcomes] == ([ErrorKind.STUFF] if left > 10 else [None])
+    assert counters(b) == ((0, 1) if left > 10 else (0, 0))
+    assert a.pending() is None
+
+
+@pytest.mark.virtual_time
+async def test_a_receiver_is_cut_off_in_the_middle_of_a_frame() -> None:
+    watch = Watch()
+    a, b = watch.attach("A", one_shot=True), watch.attach("B")
+    a.request(FRAME)
+    await at(watch, 60 * BIT)
+    b.cut_wire()
+    await asyncio.sleep(0.001)
+    assert [kind for _, _, kind, _ in watch.of("error")] == [ErrorKind.ACK]
+    assert (counters(a), counters(b)) == ((8, 0), (0, 1))
+
+
+@pytest.mark.virtual_time
+async def test_bus_off_power_and_a_cut_wire() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    await into_bus_off(watch, a)
+    a.cut_wire()
+    await asyncio.sleep(0.1)
+    assert a.state is ControllerState.ACTIVE  # it hears nothing but recessive bits
+    await into_bus_off_again(watch, a)
+    a.mend_wire()
+    await asyncio.sleep(0.1)
+    assert a.state is ControllerState.ACTIVE
+    a.cut_wire()
+    a.power_off()
+    a.mend_wire()
+    a.power_on()
+    b.request(OTHER)
+    await asyncio.sleep(0.1)
+    assert watch.of("received")[-1][:2] == ("A", OTHER)
+
+
+async def into_bus_off_again(watch: Watch, node: CanController) -> None:
+    node.mend_wire()
+    await asyncio.sleep(0.001)
+    await into_bus_off(watch, node)
+    node.cut_wire()

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from r2p.codecs.can_bits import (
+    ARBITRATION_FIELDS,
     INTERMISSION,
     TAIL,
     Frame,
+    OtherFrame,
     bits_until_lost,
     field_at,
     frame_bits,
@@ -23,8 +25,10 @@ from r2p.codecs.can_bits import (
     wire_bits,
     wire_identifier,
 )
-from r2p.sim.can.controller import BusWire, CanController, ignore
+from r2p.sim.can.controller import RECESSIVE_BITS, BusWire, CanController, ignore
 from r2p.sim.can.error_frames import (
+    DELIMITER,
+    FLAG,
     Disturbance,
     ErrorFrame,
     bits_until_noticed,
@@ -78,27 +82,36 @@ class CanBus(BusWire):
     """
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, *, bitrate: int = 1_000_000, noise: float = 0.0, seed: int = 0
+        self,
+        loop: asyncio.AbstractEventLoop,
+        *,
+        bitrate: int = 1_000_000,
+        noise: float = 0.0,
+        seed: int = 0,
+        timeline: Timeline | None = None,
     ) -> None:
         """`bitrate` in bit/s, such that a bit takes whole ns. `noise`: the share of frames with a bit error.
 
-        Each node has its own random numbers, which follow from `seed` and its name.
+        Each node has its own random numbers, which follow from `seed` and its name. `timeline`: that of another bus, so
+        that their events are in order.
         """
         bit, rest = divmod(SECOND, bitrate)
         if rest:
             raise ValueError(f"at {bitrate} bit/s a bit does not take whole nanoseconds")
-        self.timeline = Timeline(loop)
+        self.timeline = timeline or Timeline(loop)
         self.bit = bit
         self.noise = noise
         self.statistics = Statistics(bit, self.timeline.now())
         self.observers: list[Callable[[FrameRecord], object]] = []
         self.loss_observers: list[Callable[[ArbitrationLoss], object]] = []
+        self._loop = loop
         self._seed = seed
         self._numbers = random.Random(f"{seed}")
         self._names: set[str] = set()
         self._listeners = Listeners()
         self._noisy = False  # whether a node has noise of its own
         self._disturbances: list[Disturbance] = []
+        self._stuck_until = 0  # the bus is dominant up to this instant, whatever is sent
         self._free = 0  # from when on a frame may start
         self._contenders: dict[ControllerMailboxes, None] = {}  # all that may have something to send, in order
         self._start: int | None = None  # of the next frame
@@ -134,6 +147,21 @@ class CanBus(BusWire):
         """
         if count > 0:
             self._disturbances.append(Disturbance(bit, count, identifier, sender))
+
+    def short(self, duration: int) -> None:
+        """Hold the bus dominant for `duration` ns from now on, as a short circuit of its wires does.
+
+        A frame on the wire is destroyed at the first recessive bit of its sender; within the arbitration field, it
+        loses. A free bus looks like the start of a frame, which breaks the rules after six bits: that is recorded as a
+        failed attempt without senders, of the frame that the bits would begin. All controllers count errors as long as
+        the bus is dominant: who was sending goes to bus-off, the others become error passive.
+        """
+        self._stuck_until = max(self._stuck_until, self.timeline.now() + duration)
+        if self._transfer is None:
+            self._dominate()
+        elif not self._transfer.destroyed:
+            self._short(self._transfer)
+        # otherwise an error frame is on the wire, and lasts longer
 
     def load(self) -> float:
         """Return the share of the time that the bus was occupied since the start or `reset_statistics`."""
@@ -186,11 +214,63 @@ class CanBus(BusWire):
     def connect(self, controller: CanController) -> None:
         self._listeners.join(controller)
 
+    def cut(self, controller: CanController) -> BusWire:
+        alone = CanBus(self._loop, bitrate=SECOND // self.bit, timeline=self.timeline)
+        transfer, now = self._transfer, self.timeline.now()
+        sending, start, free = None, 0, max(now, self._free)
+        if transfer and not transfer.destroyed:
+            left = transfer.bits + (transfer.start - now) // self.bit  # bits of the frame that are not on the wire yet
+            end, start = transfer.start + transfer.bits * self.bit, transfer.start
+            sent = next((each for each in transfer.requests if each.owner is controller), None)
+            if sent and left > _BITS_AFTER_ACK:
+                sending = sent
+            elif sent:
+                free = end + INTERMISSION * self.bit
+                controller.complete(sent, end)  # acknowledged: its frame will be complete
+            elif controller in transfer.receivers and left > TAIL:
+                controller.disturb(1)  # silence in the middle of a frame: a stuff error
+        if self.leave(controller):
+            alone.recover(controller)
+        alone.carry(controller, free, sending, start)
+        return alone
+
+    def carry(
+        self, controller: CanController, free: int, sending: TransmitRequest | None = None, start: int = 0
+    ) -> None:
+        """Let this controller take part from `free` on, or go on to send a frame that began at `start`."""
+        self._free = free
+        self._contenders[controller.mailboxes] = None
+        if controller.live:
+            self.connect(controller)
+        if sending:
+            self._busy = True
+            self._send([sending], start)
+        self.replan()
+
+    def mend(self, controller: CanController, alone: BusWire) -> None:
+        now = self.timeline.now()
+        recovering = alone.leave(controller)
+        controller.mailboxes.not_before = now + RECESSIVE_BITS * self.bit
+        for request in controller.mailboxes.requests.values():
+            request.busy_until = now
+        self.carry(controller, self._free)
+        if recovering:
+            self.recover(controller)
+
+    def leave(self, controller: CanController) -> bool:
+        recovering = self._recovery.forget(controller)
+        self._contenders.pop(controller.mailboxes, None)
+        self.disconnect(controller)
+        return recovering
+
     def forget_filters(self) -> None:
         self._listeners.concerned.clear()
 
     def recover(self, controller: CanController) -> None:
-        self._recovery.begin(controller, max(self.timeline.now(), self._free))
+        now = self.timeline.now()
+        self._recovery.begin(controller, max(now, self._free))
+        if self._stuck_until > now:
+            self._recovery.busy(now)
 
     # The start of a frame
 
@@ -289,6 +369,9 @@ class CanBus(BusWire):
         self._over(transfer, transfer.bits, None, end)
 
     def _over(self, transfer: _Transfer, bits: int, error: ErrorKind | None, end: int) -> None:
+        if error is not None and self._stuck_until > end - DELIMITER * self.bit:
+            self._extend(transfer, error, end - DELIMITER * self.bit)
+            return
         record = FrameRecord(transfer.start, end, transfer.frame, transfer.names, bits, error)
         self.statistics.add(record)
         self._transfer = None
@@ -417,6 +500,71 @@ class CanBus(BusWire):
             kind = ErrorKind.FORM if bit > len(wire) - TAIL else ErrorKind.STUFF
         seen = BusError(kind, bit, field_at(transfer.frame, bit), sending=sent is not None)
         node.see_error(seen, transfer.start + bit * self.bit)
+
+    # A bus that is stuck at dominant
+
+    def _dominate(self) -> None:
+        """Let the dominant level of a free bus look like the start of a frame."""
+        now = self.timeline.now()
+        self._start = None
+        self._plan += 1
+        self._busy = True
+        if self._recovery.remaining:
+            self._recovery.busy(now)
+        dominant = -((now - self._stuck_until) // self.bit)  # bits, rounded up
+        bus = "0" * FLAG if dominant >= FLAG else "0" * dominant + "1" * FLAG
+        receivers, silent = self._listeners.live.copy(), self._listeners.silent.copy()
+        self._transfer = transfer = _Transfer(OtherFrame(0), [], (), receivers, silent, now, len(bus))
+        self._destroy(transfer, bus, ErrorKind.STUFF, receivers)
+
+    def _short(self, transfer: _Transfer) -> None:
+        """Let the dominant level destroy the frame on the wire, if it lasts until a recessive bit."""
+        frame, wire = transfer.frame, wire_bits(transfer.frame)
+        first = (self.timeline.now() - transfer.start) // self.bit + 1  # the bit that is on the wire now
+        acknowledge = len(wire) - _BITS_AFTER_ACK
+        bit = next((n for n in range(first, len(wire) + 1) if wire[n - 1] == "1" and n != acknowledge), None)
+        if bit is None:
+            self.timeline.at(transfer.start + transfer.bits * self.bit, self._still_stuck)
+        elif transfer.start + bit * self.bit <= self._stuck_until:
+            bus = wire[: bit - 1] + "0"
+            if field_at(frame, bit) not in ARBITRATION_FIELDS:
+                self._destroy(transfer, bus, ErrorKind.BIT, transfer.owners)
+                return
+            for request in transfer.requests:
+                self.statistics.add_lost(request.owner.name, frame)
+                request.owner.lose_arbitration(request, transfer.start + bit * self.bit)
+            transfer.receivers = [*transfer.receivers, *transfer.owners]
+            transfer.requests = []
+            bus += "0" * bits_until_noticed(bus, wire, "0")
+            self._destroy(transfer, bus, ErrorKind.STUFF, transfer.receivers)
+
+    def _still_stuck(self) -> None:
+        if self._transfer is None and self._stuck_until > self.timeline.now():
+            self._dominate()
+
+    def _extend(self, transfer: _Transfer, error: ErrorKind, flags_end: int) -> None:
+        """Let the delimiter of an error frame begin only when the bus is no longer stuck."""
+        bits = -((transfer.start - self._stuck_until) // self.bit) + DELIMITER
+        end = transfer.start + bits * self.bit
+        self.timeline.at(end, self._over, transfer, bits, error, end)
+        owners = transfer.owners
+        for node in self._listeners.live.copy():
+            if node not in owners:  # a dominant bit right after its error flag
+                node.disturb(8)
+        self.timeline.at(flags_end + DELIMITER * self.bit, self._count_stuck, owners)
+
+    def _count_stuck(self, owners: list[CanController]) -> None:
+        """Count 8 more dominant bits after the error flags, as long as that changes a state."""
+        now, live = self.timeline.now(), self._listeners.live.copy()
+        if now > self._stuck_until:
+            return
+        for node in live:
+            if node in owners:
+                node.confinement.count(transmit=8)
+            elif not node.confinement.passive:
+                node.disturb(8)
+        if any(node in owners or not node.confinement.passive for node in self._listeners.live):
+            self.timeline.at(now + DELIMITER * self.bit, self._count_stuck, owners)
 
     def _node_died(self, transfer: _Transfer, controller: CanController) -> None:
         """Leave a controller out of the frame that is on the wire."""

@@ -62,6 +62,15 @@ class BusWire(Protocol):
     def recover(self, controller: CanController) -> None:
         """Let this controller leave bus-off after enough recessive bits."""
 
+    def cut(self, controller: CanController) -> BusWire:
+        """Leave this controller out, and return a wire that has it alone, with what it is sending."""
+
+    def mend(self, controller: CanController, alone: BusWire) -> None:
+        """Take a controller back from such a wire."""
+
+    def leave(self, controller: CanController) -> bool:
+        """Forget this controller and what it wants to send. Return whether it is on its way out of bus-off."""
+
 
 class CanController:
     """A controller, made by `CanBus.attach`. Set the callbacks you need; stamps are of this node's clock, in ns."""
@@ -96,7 +105,7 @@ class CanController:
         self._transmit_delay = node.transmit.sampler(self.numbers)
         self._ahead = node.transmit.nominal
         self._interrupts = Interrupts(bus.timeline, self.clock, node.receive.sampler(self.numbers))
-        self._bus = bus
+        self._bus = self._whole = bus  # not the same while its wire is cut
         self._timeline = bus.timeline
         self._source = bus.timeline.source
         self._filters: Sequence[tuple[int, int]] = ()
@@ -221,6 +230,21 @@ class CanController:
         if self.state is ControllerState.DOWN:
             self.mailboxes.not_before = self._timeline.now() + RECESSIVE_BITS * self._bus.bit
             self.rejoin()
+
+    def cut_wire(self) -> None:
+        """Cut the wire to this node, also in the middle of a frame, until `mend_wire`.
+
+        It hears nothing, and no other node hears it. It can't know: what it sends is not acknowledged, so it becomes
+        error passive and tries for ever. Statistics and observers of the bus have nothing of that.
+        """
+        if self._bus is self._whole:
+            self._bus = self._whole.cut(self)
+
+    def mend_wire(self) -> None:
+        """Mend the wire to this node: it takes part after 11 recessive bits, with its error counters as they are."""
+        if self._bus is not self._whole:
+            alone, self._bus = self._bus, self._whole
+            self._whole.mend(self, alone)
 
     # For the bus
 

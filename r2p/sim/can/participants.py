@@ -86,8 +86,9 @@ class Recovery:
         self._since[controller] = since
         self._wait(controller)
 
-    def forget(self, controller: CanController) -> None:
-        self.remaining.pop(controller, None)
+    def forget(self, controller: CanController) -> bool:
+        """Count no longer for this controller. False: it was not on its way out."""
+        return self.remaining.pop(controller, None) is not None
 
     def busy(self, start: int) -> None:
         """Count the sequences up to the start of a frame."""
