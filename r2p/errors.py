@@ -56,7 +56,8 @@ class TypeMismatch(Error, TypeError):
 
 class TransportError(Error):
     """A transport that can't be made: its URL has an unknown scheme or option, its library is missing, its address is
-    refused; or, with `strict=True`, one that gives less than a publisher asks for.
+    refused; or, with `strict=True`, one that gives less than a publisher asks for. Also a module without the transport
+    that a call needs: `Node.on_sync` needs RTCAN.
     """
 
 
