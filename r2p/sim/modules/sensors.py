@@ -204,9 +204,12 @@ async def sensors(node: r2p.Node, unit: InertialUnit) -> None:
     def refilter(_value: float) -> None:
         unit.attitude.gain, unit.attitude.bias_gain = gain.value, bias_gain.value
 
-    acc = node.parameter("acc_range", AccelerometerRange["2g"], doc="Range of the accelerometer", on_change=rescale)
-    gyro = node.parameter("gyro_range", GyroscopeRange["250dps"], doc="Range of the gyroscope", on_change=rescale)
-    mag = node.parameter("mag_range", MagnetometerRange["1.3gauss"], doc="Range of the magnetometer", on_change=rescale)
+    acc_range = AccelerometerRange(unit.accelerometer.range)
+    gyro_range = GyroscopeRange(unit.gyroscope.range)
+    mag_range = MagnetometerRange(unit.magnetometer.range)
+    acc = node.parameter("acc_range", acc_range, doc="Range of the accelerometer", on_change=rescale)
+    gyro = node.parameter("gyro_range", gyro_range, doc="Range of the gyroscope", on_change=rescale)
+    mag = node.parameter("mag_range", mag_range, doc="Range of the magnetometer", on_change=rescale)
     doc = "How fast gravity and magnetic field correct the attitude"
     usual, usual_bias = unit.attitude.gains
     gain = quantity(node, "filter_gain", usual, (0.0, 100.0), "1/s", doc, refilter)

@@ -68,6 +68,8 @@ class MemsSensor:
 
     def __init__(self, spec: MemsSpec, noise: random.Random) -> None:
         self.spec = spec
+        self.range = spec.full_scale, spec.resolution
+        """The range that it was made with."""
         self.counts: Counts = (0, 0, 0)
         """The last sample, in counts."""
         self.samples = 0

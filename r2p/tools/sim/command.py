@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 _FAST = 60.0  # seconds
 
-_Name = Literal["triskar2"]
-_DISPLAYS: dict[_Name, str] = {"triskar2": "Triskar2Display"}
+_Name = Literal["triskar2", "tiltone"]
+_DISPLAYS: dict[_Name, str] = {"triskar2": "Triskar2Display", "tiltone": "TiltOneDisplay"}
 """The display of each robot, in a module with its name."""
-_ROBOTS = "triskar2: the omnidirectional robot of the thesis."
+_ROBOTS = "Of the thesis: triskar2, on omni wheels; tiltone, which balances on two."
 
 _Speed = Annotated[
     float | None,

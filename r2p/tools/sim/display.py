@@ -78,13 +78,13 @@ def odometry_line(odometry: OdometryFigures) -> str:
     return f"odometry  x {odometry.pose.x:z6.2f}  y {odometry.pose.y:z6.2f} m  {note}"
 
 
-def odometry_accuracy(odometry: OdometryFigures, off_max: float) -> str:
+def odometry_accuracy(odometry: OdometryFigures, off_max: float, why: str = "no two wheels have the same size") -> str:
     """Return a line about the odometry. On a square its errors cancel out: the one at the end says little."""
     now, most = round(odometry.off * 1000), round(off_max * 1000)
     if not most:
         return "odometry: exact to the millimetre"
     before = f", earlier by {most} mm" if most > now else ""
-    return f"odometry: off by {now} mm{before}: no two wheels have the same size"
+    return f"odometry: off by {now} mm{before}: {why}"
 
 
 def wheel_line(wheel: WheelFigures) -> str:

@@ -1,8 +1,7 @@
 """tiltOne in one piece: its hardware modules on one network, and the pendulum that their motors keep upright.
 
     async with TiltOne("memory:robot", seed=1) as robot:
-        await robot.ready()
-        robot.let_go()
+        await robot.release()
         ...
         robot.shove(5.0)
 
@@ -23,7 +22,14 @@ from r2p.clock import Clock, clock_of
 from r2p.msg import Effort2
 from r2p.sim.modules.boards import MotorConfig, MotorModule, Plant, PowerModule
 from r2p.sim.modules.sensors import ImuModule, InertialUnit, Motion
-from r2p.sim.physics.inertial import ACCELEROMETER, GRAVITY, GYROSCOPE, ComplementaryFilter
+from r2p.sim.physics.inertial import (
+    ACCELEROMETER,
+    GRAVITY,
+    GYROSCOPE,
+    ComplementaryFilter,
+    GyroscopeRange,
+    MemsSpec,
+)
 from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor
 from r2p.sim.physics.pendulum import Pendulum
 from r2p.sim.physics.world import Triple
@@ -95,7 +101,7 @@ class TiltOneHardware:
             self._motion,
             self.noise("IMU1"),
             accelerometer=msgspec.structs.replace(ACCELEROMETER, bias=ACCELEROMETER.bias * _CALIBRATED),
-            gyroscope=msgspec.structs.replace(GYROSCOPE, bias=GYROSCOPE.bias * _CALIBRATED),
+            gyroscope=_gyroscope(),
             attitude=ComplementaryFilter(gain=_FILTER[0], bias_gain=_FILTER[1]),
         )
         self.plant = Plant([*self.drives, self.body, self.inertial, self], dt=STEP)
@@ -141,6 +147,13 @@ class TiltOneHardware:
             rates=(-r * sin, q, r * cos),
             field=(forward * cos - up * sin, -north * math.sin(body.w), forward * sin + up * cos),
         )
+
+
+def _gyroscope() -> MemsSpec:
+    """Return the data sheet of the calibrated gyroscope, in a range that a fall does not exceed."""
+    full_scale, resolution = GyroscopeRange["500dps"].value
+    bias = GYROSCOPE.bias * _CALIBRATED
+    return msgspec.structs.replace(GYROSCOPE, full_scale=full_scale, resolution=resolution, bias=bias)
 
 
 class TiltOne(EmulatedRobot):
@@ -217,6 +230,10 @@ class TiltOne(EmulatedRobot):
         """Raise it from the floor within so many seconds, hold it until its motors work, and let go."""
         self.hardware.stand_up(seconds)
         await asyncio.sleep(seconds)
+        await self.release()
+
+    async def release(self) -> None:
+        """Hold it until its motors work, then let go: the controllers first make sure that it is upright."""
         while not all(drive.setpoint for drive in self.hardware.drives):  # noqa: ASYNC110 - physics have no events
             await asyncio.sleep(_POLL)
         self.let_go()
