@@ -1,8 +1,9 @@
-"""Draws `assets/diagrams/`: a message's way through the files, and the tree that gateways agree on.
+"""Draws `assets/diagrams/`: a message's way through the files, the tree that gateways agree on, and a robot's balance.
 
-Run it from the root of the project when a walk in `architecture.md` or the gateways' protocol changes:
+Run it from the root of the project when a walk in `architecture.md`, the gateways' protocol or that robot changes:
 `python docs/draw_diagrams.py`. The way is drawn from the tables in `architecture.md`, which tests compare with the
-code. The tree is that of real gateways under virtual time. A test compares pictures and code.
+code. The tree is that of real gateways under virtual time, the balance that of the emulated tiltOne. A test compares
+pictures and code.
 """
 
 import asyncio
@@ -16,6 +17,7 @@ from xml.sax.saxutils import escape
 
 import r2p
 from r2p import sim
+from r2p.tools.sim.tiltone import TiltOneDisplay, TiltOneFigures
 
 FOLDER = Path(__file__).parent / "assets" / "diagrams"
 
@@ -32,6 +34,9 @@ _STYLE = """
     .arrow { stroke: #76808e; stroke-width: 1.8; fill: none }
     .head { fill: #76808e }
     .wire { stroke: #76808e; stroke-width: 5; stroke-linecap: round; fill: none }
+    .axis { stroke: #76808e; stroke-width: 1; stroke-opacity: .5; fill: none }
+    .curve { stroke: #4f46e5; stroke-width: 2; stroke-linejoin: round; fill: none }
+    .wanted { stroke: #b45309; stroke-width: 1.6; stroke-dasharray: 5 4; fill: none }
     .forwards { stroke: #0f766e; stroke-width: 3.5; fill: none }
     .blocked { stroke: #b45309; stroke-width: 2.5; stroke-dasharray: 3 6; fill: none }
     @media (prefers-color-scheme: dark) {
@@ -40,6 +45,8 @@ _STYLE = """
       .nodes { fill: #a5b4fc; stroke: #a5b4fc }
       .bytes { fill: #fbbf77; stroke: #fbbf77 }
       .links { fill: #5eead4; stroke: #5eead4 }
+      .curve { stroke: #a5b4fc }
+      .wanted { stroke: #fbbf77 }
       .forwards { stroke: #5eead4 }
       .blocked { stroke: #fbbf77 }
     }"""
@@ -47,7 +54,7 @@ _STYLE = """
 
 def pictures() -> dict[str, str]:
     """Return all pictures by their file names."""
-    return {"message.svg": message(), "gateways.svg": gateways()}
+    return {"message.svg": message(), "gateways.svg": gateways(), "tiltone.svg": balance()}
 
 
 def _svg(width: float, height: float, title: str, parts: Iterator[str]) -> str:
@@ -225,6 +232,85 @@ def _port(gateway: _Gateway, network: _Network) -> str:
         end = network.right if network.right < gateway.x else network.left
         return f"M{gateway.x + math.copysign(34, end - gateway.x):g} {gateway.y:g} H{end:g}"
     return f"M{gateway.x:g} {gateway.y + math.copysign(20, network.y - gateway.y):g} V{network.y:g}"
+
+
+# A robot's balance
+
+_SPAN, _STRIDE = 22.0, 0.1  # s of the demonstration, and between two points
+_PANEL, _ACROSS, _MARGIN = 130, 640, 58  # px: height and width of a curve, and what is left of it
+_PARTS = {0.0: "stand", 3.0: "drive", 8.0: "turn", 12.0: "shove", 16.0: "stop"}  # s, as `velocity_at` has them
+
+
+class _Curve(NamedTuple):
+    name: str
+    limits: tuple[float, float]
+    marks: tuple[float, ...]
+    actual: list[float]
+    wanted: list[float]
+
+
+def balance() -> str:
+    """Return how tilt and speed of tiltOne follow what is wanted of them, in its demonstration."""
+    figures = sim.run(_ride, seed=1)
+    tilts = [math.degrees(each.tilt) for each in figures]
+    leans = [math.degrees(each.wanted_tilt or 0.0) for each in figures]
+    speeds = [each.speed for each in figures]
+    commands = [each.command.x if each.command else 0.0 for each in figures]
+    curves = [
+        _Curve("tilt, deg", (-10.0, 10.0), (-8.0, 0.0, 8.0), tilts, leans),
+        _Curve("speed, m/s", (-0.6, 1.0), (0.0, 0.5), speeds, commands),
+    ]
+    title = "Tilt and speed of tiltOne: it stands, drives, turns, is shoved and stops"
+    return _svg(720, 62 + len(curves) * (_PANEL + 18), title, _drawn_curves(curves))
+
+
+async def _ride() -> list[TiltOneFigures]:
+    """The demonstration of `r2p sim tiltone`, from when the hands let go."""
+    via = "memory:balance"
+    display = TiltOneDisplay(via, seed=1)
+    async with display.robot as robot, r2p.Module("PC1", via=via, watchdog=False) as pc:
+        await robot.ready()
+        await robot.release()
+        display.watch(pc)
+        display.drive(pc, rounds=1)
+        figures = []
+        for _ in range(round(_SPAN / _STRIDE) + 1):
+            figures.append(display.read())
+            await asyncio.sleep(_STRIDE)
+        return figures
+
+
+def _drawn_curves(curves: list[_Curve]) -> Iterator[str]:
+    across = _ACROSS / _SPAN
+    bottom = 24 + len(curves) * (_PANEL + 18)
+    for start, part in _PARTS.items():
+        x = _MARGIN + start * across
+        yield f'<path class="axis" d="M{x:.1f} 14 V{bottom - 12}"/>'
+        yield _text("note", x + 4, 22, part)
+    for number, curve in enumerate(curves):
+        yield from _panel(curve, 28 + number * (_PANEL + 18))
+    for second in range(0, round(_SPAN) + 1, 2):
+        yield _text("note middle", round(_MARGIN + second * across, 1), bottom + 4, str(second))
+    yield _text("note middle", _MARGIN + _ACROSS + 16, bottom + 4, "s")
+    for x, style, meaning in ((_MARGIN, "curve", "actual"), (_MARGIN + 110, "wanted", "wanted")):
+        yield f'<path class="{style}" d="M{x} {bottom + 24} h30"/>'
+        yield _text("note", x + 38, bottom + 28, meaning)
+
+
+def _panel(curve: _Curve, top: float) -> Iterator[str]:
+    low, high = curve.limits
+
+    def y(value: float) -> float:
+        return top + (high - value) / (high - low) * _PANEL
+
+    yield f'<text class="note middle" transform="translate(14 {top + _PANEL / 2:g}) rotate(-90)">{curve.name}</text>'
+    for mark in curve.marks:
+        yield f'<path class="axis" d="M{_MARGIN} {y(mark):.1f} h{_ACROSS}"/>'
+        yield _text("note", _MARGIN - 30, round(y(mark) + 4, 1), f"{mark:g}")
+    for style, values in (("wanted", curve.wanted), ("curve", curve.actual)):
+        step = _ACROSS / (len(values) - 1)
+        points = " ".join(f"{_MARGIN + index * step:.1f},{y(value):.1f}" for index, value in enumerate(values))
+        yield f'<polyline class="{style}" points="{points}"/>'
 
 
 if __name__ == "__main__":

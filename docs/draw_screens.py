@@ -37,6 +37,7 @@ from r2p.tools.session import Settings, join
 from r2p.tools.sim import run
 from r2p.tools.sim.run import simulate
 from r2p.tools.sim.screen import SimulatorScreen
+from r2p.tools.sim.tiltone import TiltOneDisplay
 from r2p.tools.sim.triskar2 import Triskar2Display
 from r2p.tools.top.app import TopApp
 from r2p.tools.top.topic_screen import TopicScreen
@@ -48,6 +49,8 @@ COLUMNS, NARROW = 80, 48
 """Of a terminal, and of one that fits a phone."""
 MOMENT = 11.25
 """Seconds of the demo, in the picture."""
+SHOVED = 12.25
+"""Seconds of `r2p sim tiltone`, in the picture: just after the shove."""
 
 _OUTSIDE = "memory:lab"  # where the emulated robot is looked at; the picture shows an address as users have it
 _ADDRESS = "tcp:127.0.0.1:45123"
@@ -158,7 +161,7 @@ def _chunk(classes: str, column: int, row: int, text: str) -> str:
 
 def pictures() -> dict[str, str]:
     """Return all pictures by their file names."""
-    screens = _beside_the_robot() | {"doctor": _doctor()}
+    screens = _beside_the_robot() | _balancing() | {"doctor": _doctor()}
     screens["admit"], slots = _admit()
     return {f"{name}.svg": draw(screen) for name, screen in screens.items()} | {"slots.svg": slots}
 
@@ -211,6 +214,30 @@ async def _robot() -> dict[str, Screen]:
     return screens
 
 
+def _balancing() -> dict[str, Screen]:
+    with _terminal(), patch.object(run, "addresses", lambda _robot: [_ADDRESS]):
+        return sim.run(_tiltone, seed=1)
+
+
+async def _tiltone() -> dict[str, Screen]:
+    """The balancing robot, when it was shoved."""
+    screens: dict[str, Screen] = {}
+
+    def show(screen: SimulatorScreen, figures: RobotFigures) -> None:
+        if not screens and figures.time >= SHOVED - 0.01:
+            screens["tiltone"] = _frame(screen, figures, COLUMNS, 24, "r2p sim tiltone --drive")
+            seen.set()
+
+    seen = asyncio.Event()
+    with patch.object(SimulatorScreen, "show", show):
+        robot = asyncio.create_task(simulate(TiltOneDisplay, outside=[_OUTSIDE], rounds=1))
+        await seen.wait()
+        robot.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await robot
+    return screens
+
+
 async def _top() -> dict[str, Screen]:
     """The tables of `r2p top`, and what opens from them."""
     screens, command = {}, f"r2p top --via {_ADDRESS}"
@@ -238,13 +265,15 @@ def _ansi(app: TopApp) -> str:
     return "\n".join(strip.render(console) for strip in strips)
 
 
-def _frame(screen: SimulatorScreen, figures: RobotFigures, columns: int, lines: int) -> Screen:
-    """One frame of the demo, on a terminal of this size."""
+def _frame(
+    screen: SimulatorScreen, figures: RobotFigures, columns: int, lines: int, command: str = "r2p demo"
+) -> Screen:
+    """One frame of a robot, on a terminal of this size."""
     output = io.StringIO()
     size = {"width": columns, "height": lines}
     screen.console = Console(file=output, **size, **_COLOURED)
     screen.console.print(screen.draw(figures))
-    return Screen("r2p demo", output.getvalue(), columns)
+    return Screen(command, output.getvalue(), columns)
 
 
 def _admit() -> tuple[Screen, str]:
