@@ -360,11 +360,11 @@ class CanBus(BusWire):
     def _finish(self, transfer: _Transfer, end: int) -> None:
         if transfer.destroyed:
             return
-        frame = transfer.frame
+        frame, receivers, silent = transfer.frame, transfer.receivers, transfer.silent
         for request in transfer.requests:
             request.owner.complete(request, end)
         for node in self._listeners.concerned[frame.id if frame.__class__ is Frame else ~wire_identifier(frame)]:
-            if node in transfer.receivers or node in transfer.silent:
+            if node in receivers or (silent and node in silent):
                 node.receive(frame, end)
         self._over(transfer, transfer.bits, None, end)
 

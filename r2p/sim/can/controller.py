@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from r2p.codecs.can_bits import AnyFrame, OtherFrame
-    from r2p.sim.can.records import BusError, CanNode
+    from r2p.sim.can.records import BusError, CanNode, Latency
     from r2p.sim.can.timeline import Timeline, TimelineTimer
 
 _BABBLE: Final = -1
@@ -104,7 +104,7 @@ class CanController:
         self.confinement = Confinement(self._changed)
         self._transmit_delay = node.transmit.sampler(self.numbers)
         self._ahead = node.transmit.nominal
-        self._interrupts = Interrupts(bus.timeline, self.clock, node.receive.sampler(self.numbers))
+        self._interrupts = Interrupts(bus.timeline, self.clock, node.receive, self.numbers)
         self._bus = self._whole = bus  # not the same while its wire is cut
         self._timeline = bus.timeline
         self._source = bus.timeline.source
@@ -157,7 +157,8 @@ class CanController:
             if ahead > given:
                 given = ahead
         last = NEVER if not_after is None else clock.true(not_after + 1) - 1
-        self._put(TransmitRequest(self, frame, mailbox, given + self._transmit_delay(), last))
+        ready = given + (self._transmit_delay() if self._transmit_delay else self._ahead)
+        self._put(TransmitRequest(self, frame, mailbox, ready, last))
         return True
 
     def abort(self, mailbox: int = 0) -> bool:
@@ -507,14 +508,15 @@ class ControllerMailboxes:
 class Interrupts:
     """Calls the callbacks of the node's software, each with the time of the node's clock as its last argument.
 
-    They come a little late, in the order of the events, and never after the node has lost power. `delay()` returns the
-    ns from an event to the moment when its interrupt is served.
+    They come a little late, in the order of the events, and never after the node has lost power. `latency` is from an
+    event to the moment when its interrupt is served.
     """
 
-    def __init__(self, timeline: Timeline, clock: LocalClock, delay: Callable[[], int]) -> None:
+    def __init__(self, timeline: Timeline, clock: LocalClock, latency: Latency, numbers: random.Random) -> None:
         self._timeline = timeline
         self._clock = clock
-        self._delay = delay
+        self._nominal = latency.nominal
+        self._delay = latency.sampler(numbers)
         self._life = 0  # counts power cuts: interrupts from before one are not served
         self._latest = 0  # when the last interrupt so far is served: none overtakes another, whatever their delays
 
@@ -522,7 +524,7 @@ class Interrupts:
         """Call the handler for an event on the bus at `when`."""
         if handler is ignore:
             return
-        at = when + self._delay()
+        at = when + (self._delay() if self._delay else self._nominal)
         if at < self._latest:
             at = self._latest
         self._latest = at
@@ -530,7 +532,7 @@ class Interrupts:
 
     def check_at(self, when: int, handler: Callable[..., object], *args: Any) -> None:
         """Call the handler for a time-out at `when`, which does not hold up the events after it."""
-        at = when + self._delay()
+        at = when + (self._delay() if self._delay else self._nominal)
         self._timeline.at(at, self._serve, at, self._life, handler, args)
 
     def discard(self) -> None:

@@ -50,10 +50,10 @@ class Latency(msgspec.Struct, frozen=True):
                 f"the jitter ({self.jitter} ns) must be between 0 and the nominal delay ({self.nominal} ns)"
             )
 
-    def sampler(self, numbers: random.Random) -> Callable[[], int]:
-        """A function that returns one random delay after the other, in ns."""
+    def sampler(self, numbers: random.Random) -> Callable[[], int] | None:
+        """A function that returns one random delay after the other, in ns; None if all are `nominal`."""
         if not self.jitter:
-            return lambda: self.nominal
+            return None
         shortest, span, draw = self.nominal - self.jitter, 2 * self.jitter + 1, numbers.random
         return lambda: shortest + int(draw() * span)
 
