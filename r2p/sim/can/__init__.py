@@ -6,6 +6,11 @@
     b.on_receive = lambda frame, stamp: print(stamp, frame)
     a.request(Frame(0x19007F80, b"hello"))
 
+All frames of CAN 2.0 share the bus: `Frame` is a data frame with a 29-bit identifier, as RTCAN sends, `OtherFrame` any
+other kind. Controllers see error frames (`on_bus_error`); some only listen. Faults are deterministic: bit errors by
+seed or to order (`CanBus.disturb_next`), a short circuit (`CanBus.short`), and of a node a cut wire, a power failure,
+babbling, lost frames.
+
 Under virtual time every event happens at its exact nanosecond; on an ordinary loop the bus is paced to real time:
 events keep their exact instants on the bus, and run as soon as the loop gets to them.
 
