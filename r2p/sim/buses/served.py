@@ -1,0 +1,306 @@
+"""An attachment to a bus that another process serves: a connection, and a thread that reads it.
+
+`send` writes to the connection in its own thread, so a frame waits for nothing; the server returns how many frames have
+left the queue. Received events stay as records until a program takes them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from r2p.errors import Closed, DecodeError, Error, TransportError
+from r2p.log_lines import get_logger
+from r2p.sim.buses import rendezvous, wire
+from r2p.sim.buses.attachment import TX_QUEUE, BusAttachment, BusFrame
+from r2p.sim.can import ControllerState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from r2p.codecs.can_bits import Frame, OtherFrame
+    from r2p.sim.buses.attachment import AttachmentOptions, BusFilter
+    from r2p.sim.buses.rendezvous import ServedBus
+
+logger = get_logger("r2p.sim.buses")
+
+_ANSWER_TIMEOUT: Final = 5.0  # seconds for the server's greeting
+_CLOSE_TIMEOUT: Final = 5.0  # ... and for the thread to end
+_BUFFER: Final = 1 << 16  # bytes read at once
+
+
+def connect(channel: str, options: AttachmentOptions) -> ServedAttachment | None:
+    """Attach to the bus of that name of another process; None if no program serves one.
+
+    Raises TransportError if the server refuses, as for another bit rate, or does not answer.
+    """
+    served = rendezvous.find(channel)
+    if served is None:
+        return None
+    if served.pid == os.getpid() and _in_loop():
+        raise TransportError(f"the bus {channel} is served by this program, whose event loop would wait for itself")
+    try:
+        connection = socket.create_connection(("127.0.0.1", served.port), _ANSWER_TIMEOUT)
+    except ConnectionRefusedError:
+        return None  # the server was killed
+    try:
+        description = _greet(connection, served, options)
+    except BaseException:
+        connection.close()
+        raise
+    if description is None:
+        connection.close()
+        return None
+    connection.settimeout(None)
+    return ServedAttachment(connection, served, description, options)
+
+
+def _in_loop() -> bool:
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    return True
+
+
+def _greet(
+    connection: socket.socket, served: ServedBus, options: AttachmentOptions
+) -> wire.BusDescription | None:
+    """Exchange greetings. Return None if a stranger listens at the port of a server that was killed."""
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    own, expected = served.secret[: wire.PROOF_SIZE], served.secret[wire.PROOF_SIZE :]
+    silent = f"process {served.pid}, which serves the bus {served.name}, does not answer: end it"
+    try:
+        connection.sendall(wire.encode_greeting(own, msgspec.json.encode(options)))
+        head = wire.decode_greeting(_read(connection, wire.GREETING_SIZE))
+        body = _read(connection, head.size)
+    except DecodeError:
+        return None
+    except (OSError, EOFError) as error:
+        raise TransportError(silent) from error
+    if head.proof == expected:
+        return msgspec.json.decode(body, type=wire.BusDescription)
+    if any(head.proof):
+        return None
+    raise TransportError(body.decode(errors="replace"))
+
+
+def _read(connection: socket.socket, size: int) -> bytes:
+    """Return exactly so many bytes. Raises EOFError."""
+    data = b""
+    while len(data) < size:
+        more = connection.recv(size - len(data))
+        if not more:
+            raise EOFError
+        data += more
+    return data
+
+
+class ServedAttachment(BusAttachment):
+    """A controller at the bus of another process."""
+
+    def __init__(
+        self,
+        connection: socket.socket,
+        served: ServedBus,
+        description: wire.BusDescription,
+        options: AttachmentOptions,
+    ) -> None:
+        self.bitrate = description.bitrate
+        self.node = description.node
+        self.description = f"{served.name}: a bus of process {served.pid}, {self.bitrate} bit/s"
+        self._name, self._pid = served.name, served.pid
+        self._connection = connection
+        self._listen_only = options.listen_only
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)  # a new status, or the end
+        self._arrived = threading.Condition(self._lock)  # events, or the end
+        self._events: deque[wire.EventRecord] = deque()
+        self._events_max = options.rx_queue
+        self._status = wire.Status(0, 0, ControllerState.ACTIVE, 0, 0)
+        self._sent = 0
+        self._dropped = 0
+        self._warned = False
+        self._end: Callable[[], Error] | None = None  # what calls raise from now on
+        self._signal: int | None = None  # an eventfd, for `fileno`
+        self._signalled = False
+        self._thread = threading.Thread(target=self._run, name=f"r2p bus {served.name}", daemon=True)
+        self._thread.start()
+
+    # Sending
+
+    def send(self, frame: Frame | OtherFrame, timeout: float | None = None) -> None:
+        if self._listen_only:
+            raise TransportError(f"{self._name}: this attachment only listens")
+        message = wire.encode_message(wire.Kind.SEND, wire.encode_frames([frame]))
+        deadline = None if timeout is None else time.monotonic() + timeout
+        with self._lock:
+            while True:
+                self._check()
+                if self._status.state is ControllerState.BUS_OFF:
+                    raise TransportError(f"{self._name}: this controller is in bus-off, and sends nothing")
+                if self._sent - self._status.done < TX_QUEUE:
+                    break
+                if not _wait(self._changed, deadline):
+                    raise TimeoutError(f"{self._name}: no room in the queue, of {TX_QUEUE} frames, in {timeout:g} s")
+            self._sent += 1
+            self._write(message)
+
+    def flush(self) -> None:
+        self._order(wire.Kind.FLUSH)
+
+    def restart(self) -> None:
+        self._order(wire.Kind.RESTART)
+
+    def set_filters(self, filters: Sequence[BusFilter]) -> None:
+        self._order(wire.Kind.FILTERS, wire.encode_filters(filters))
+
+    def _order(self, kind: wire.Kind, body: bytes = b"") -> None:
+        with self._lock:
+            self._check()
+            self._write(wire.encode_message(kind, body))
+
+    def _write(self, message: bytes) -> None:
+        # Under the lock, so that messages of two threads do not mix. It does not wait: the window is small.
+        try:
+            self._connection.sendall(message)
+        except OSError:
+            self._finish(self._gone)
+            raise self._gone() from None
+
+    # Receiving
+
+    def receive(self, timeout: float | None = None) -> BusFrame | None:
+        if self._events and self._signal is None:  # without the lock: it costs more than all the rest
+            try:
+                return wire.decode_event(self._events.popleft())
+            except IndexError:  # another thread was faster
+                pass
+        deadline = None if timeout is None else time.monotonic() + timeout
+        with self._lock:
+            while not self._events:
+                self._check()
+                if not _wait(self._arrived, deadline):
+                    return None
+            record = self._events.popleft()
+            self._show()
+        return wire.decode_event(record)
+
+    @property
+    def lost(self) -> int:
+        return self._dropped + self._status.lost
+
+    @property
+    def state(self) -> ControllerState:
+        return self._status.state
+
+    @property
+    def error_counters(self) -> tuple[int, int]:
+        return self._status.tx_errors, self._status.rx_errors
+
+    def fileno(self) -> int:
+        with self._lock:
+            self._check()
+            if self._signal is None:
+                self._signal = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+                self._show()
+            return self._signal
+
+    def _show(self) -> None:
+        """Let `fileno` be readable if there is something for `receive`: an event, or the end."""
+        wanted = bool(self._events) or self._end is not None
+        if self._signal is None or wanted == self._signalled:
+            return
+        self._signalled = wanted
+        if wanted:
+            os.eventfd_write(self._signal, 1)
+        else:
+            os.eventfd_read(self._signal)
+
+    # The end
+
+    def close(self) -> None:
+        with self._lock:
+            self._events.clear()
+            self._finish(self._closed)
+            signal, self._signal = self._signal, None
+        if signal is not None:
+            os.close(signal)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_CLOSE_TIMEOUT)
+
+    def _closed(self) -> Error:
+        return Closed(f"the attachment to {self._name} was closed")
+
+    def _gone(self) -> Error:
+        return TransportError(
+            f"the program that served the bus {self._name} has ended (process {self._pid}): start it again, as with "
+            f"r2p bus serve {self._name}, and open the bus anew"
+        )
+
+    def _check(self) -> None:
+        if self._end is not None:
+            raise self._end()
+
+    def _finish(self, end: Callable[[], Error]) -> None:
+        """Let all calls raise this error, once the events that have arrived are read."""
+        if self._end is None or end == self._closed:
+            self._end = end
+        try:
+            self._connection.shutdown(socket.SHUT_RDWR)  # wakes the thread
+        except OSError:  # the server was faster
+            pass
+        self._changed.notify_all()
+        self._arrived.notify_all()
+        self._show()
+
+    # In the thread
+
+    def _run(self) -> None:
+        try:
+            with self._connection, self._connection.makefile("rb", buffering=_BUFFER) as stream:
+                while len(head := stream.read(wire.HEAD_SIZE)) == wire.HEAD_SIZE:
+                    kind, size = wire.decode_head(head)
+                    body = stream.read(size)
+                    if len(body) < size:
+                        break
+                    if kind == wire.Kind.EVENTS:
+                        self._take(body)
+        except (OSError, DecodeError):
+            pass
+        with self._lock:
+            self._finish(self._gone)
+
+    def _take(self, body: bytes) -> None:
+        """Note the status and the events of a message, and wake those that wait for them."""
+        status = wire.decode_status(body)
+        with self._lock:
+            if self._end is not None:
+                return
+            events, self._status = self._events, status
+            events.extend(wire.event_records(body))
+            excess = len(events) - self._events_max
+            if excess > 0:
+                self._dropped += excess
+                for _ in range(excess):
+                    events.popleft()
+            self._changed.notify_all()
+            if events:
+                self._arrived.notify_all()
+            self._show()
+        if self.lost and not self._warned:
+            self._warned = True
+            logger.warning("%s: this program reads frames too late, and loses the oldest ones", self._name)
+
+
+def _wait(condition: threading.Condition, deadline: float | None) -> bool:
+    """Wait for a condition; return False after the deadline."""
+    left = None if deadline is None else deadline - time.monotonic()
+    return condition.wait(left) if left is None or left > 0 else False
