@@ -88,16 +88,21 @@ class BusMonitor:
         if self._port is None:
             transport = from_url(parse(self.via))
             port, options = transport.make_port(), transport.options
+            port.listen_only = True
         else:
             port, options = self._port, RtcanOptions()
         self._errors = LoggedCounter(self.via, clock_of())
         self._now = port.now
-        self.since = self._now()
         self._monitor = Monitor(options.timing)
-        self._monitor.reset(self.since)
         port.set_filters(None)
         opened = asyncio.Event()
-        self._running = asyncio.create_task(port.run(self, opened.set), name=f"listen {self.via}")
+
+        def begin() -> None:
+            self.since = self._now()
+            self._monitor.reset(self.since)
+            opened.set()
+
+        self._running = asyncio.create_task(port.run(self, begin), name=f"listen {self.via}")
         self._running.add_done_callback(self._wake)
         waiting = asyncio.create_task(opened.wait())
         try:

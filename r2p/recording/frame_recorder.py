@@ -153,6 +153,7 @@ class _RecordedInterface:
 
     async def open(self) -> None:
         self._port.tap = self
+        self._port.listen_only = True
         self._port.set_filters(None)
         opened = asyncio.Event()
         self._running = asyncio.create_task(self._port.run(self, opened.set), name=f"record {self._via}")

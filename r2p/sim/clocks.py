@@ -64,21 +64,21 @@ class PacedClock(VirtualClock):
 
     def __init__(self, speed: float, real: Callable[[], int] = _SYSTEM.monotonic) -> None:
         super().__init__()
-        self._speed = speed
+        self.speed = speed
         self._real = real
         self._anchor = (real(), 0)  # a real instant, and the virtual one that belongs to it
 
     def limit(self) -> int:
         real, elapsed = self._anchor
-        return elapsed + round((self._real() - real) * self._speed)
+        return elapsed + round((self._real() - real) * self.speed)
 
     def delay(self, instant: int) -> float:
-        return max(0, instant - self.limit()) / self._speed / SECOND
+        return max(0, instant - self.limit()) / self.speed / SECOND
 
     def advance(self, latest: int) -> None:
         limit = self.limit()
         self.elapsed = max(self.elapsed, min(limit, latest))
-        lag = round(_LAG * self._speed)
+        lag = round(_LAG * self.speed)
         if limit - self.elapsed > lag:
             self._anchor = self._real(), self.elapsed + lag
 

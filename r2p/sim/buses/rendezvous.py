@@ -132,7 +132,10 @@ def _read(path: Path) -> ServedBus | None:
 def _locked(path: Path, name: str) -> int:
     """Return a file descriptor of the empty file, with a lock on it."""
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        try:
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            raise TransportError(f"can't write {path}: {error.strerror}") from error
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _is_at(path, file):

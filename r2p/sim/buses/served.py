@@ -7,10 +7,12 @@ left the queue. Received events stay as records until a program takes them.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import socket
 import threading
 import time
+import weakref
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
@@ -33,6 +35,10 @@ logger = get_logger("r2p.sim.buses")
 
 _ANSWER_TIMEOUT: Final = 5.0  # seconds for the server's greeting
 _CLOSE_TIMEOUT: Final = 5.0  # ... and for the thread to end
+_STALLED: Final = (
+    1.0  # seconds without a frame that leaves a full queue, until a sender that would wait forever gives up
+)
+_FORK: Final = "open buses after the fork"
 _BUFFER: Final = 1 << 16  # bytes read at once
 
 
@@ -70,9 +76,7 @@ def _in_loop() -> bool:
     return True
 
 
-def _greet(
-    connection: socket.socket, served: ServedBus, options: AttachmentOptions
-) -> wire.BusDescription | None:
+def _greet(connection: socket.socket, served: ServedBus, options: AttachmentOptions) -> wire.BusDescription | None:
     """Exchange greetings. Return None if a stranger listens at the port of a server that was killed."""
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     own, expected = served.secret[: wire.PROOF_SIZE], served.secret[wire.PROOF_SIZE :]
@@ -103,6 +107,20 @@ def _read(connection: socket.socket, size: int) -> bytes:
     return data
 
 
+class BusClock:
+    """The clock of a bus of another process."""
+
+    def __init__(self, description: wire.BusDescription) -> None:
+        self.speed = description.speed
+        """How many times as fast as real time it goes."""
+        self._now, self._since = description.now, description.since
+
+    def now(self) -> int:
+        """Return the time on the bus (ns). Both processes have the computer's monotonic clock."""
+        elapsed = time.monotonic_ns() - self._since
+        return self._now + (elapsed if self.speed == 1.0 else round(elapsed * self.speed))
+
+
 class ServedAttachment(BusAttachment):
     """A controller at the bus of another process."""
 
@@ -115,6 +133,8 @@ class ServedAttachment(BusAttachment):
     ) -> None:
         self.bitrate = description.bitrate
         self.node = description.node
+        """The name of this attachment's node on the bus."""
+        self.clock = BusClock(description)
         self.description = f"{served.name}: a bus of process {served.pid}, {self.bitrate} bit/s"
         self._name, self._pid = served.name, served.pid
         self._connection = connection
@@ -133,25 +153,41 @@ class ServedAttachment(BusAttachment):
         self._signalled = False
         self._thread = threading.Thread(target=self._run, name=f"r2p bus {served.name}", daemon=True)
         self._thread.start()
+        _attachments.add(self)
 
     # Sending
 
     def send(self, frame: Frame | OtherFrame, timeout: float | None = None) -> None:
-        if self._listen_only:
-            raise TransportError(f"{self._name}: this attachment only listens")
         message = wire.encode_message(wire.Kind.SEND, wire.encode_frames([frame]))
-        deadline = None if timeout is None else time.monotonic() + timeout
         with self._lock:
-            while True:
-                self._check()
-                if self._status.state is ControllerState.BUS_OFF:
-                    raise TransportError(f"{self._name}: this controller is in bus-off, and sends nothing")
-                if self._sent - self._status.done < TX_QUEUE:
-                    break
-                if not _wait(self._changed, deadline):
-                    raise TimeoutError(f"{self._name}: no room in the queue, of {TX_QUEUE} frames, in {timeout:g} s")
+            self._check()
+            if self._listen_only:
+                raise TransportError(f"{self.description}: this node only listens: open the bus without listen_only")
+            if self._status.state is ControllerState.BUS_OFF:
+                raise TransportError(
+                    f"{self.description}: bus off, after too many errors: restart the controller first"
+                )
+            if self._waiting() >= TX_QUEUE:
+                self._wait_for_room(timeout)
             self._sent += 1
             self._write(message)
+
+    def _waiting(self) -> int:
+        """Return how many frames wait for the wire."""
+        return self._sent - self._status.done
+
+    def _wait_for_room(self, timeout: float | None) -> None:
+        """Wait until the queue has room; called with the lock. Raises TimeoutError."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        goes_on = True
+        while goes_on and self._waiting() >= TX_QUEUE:
+            done = self._status.done
+            left = _STALLED if deadline is None else deadline - time.monotonic()
+            goes_on = left > 0 and (self._changed.wait(left) or (deadline is None and done != self._status.done))
+            self._check()
+        if self._waiting() >= TX_QUEUE:
+            why = ": the first one fails again and again" if self._status.tx_errors else ""
+            raise TimeoutError(f"{self.description}: the queue of {TX_QUEUE} frames is full{why}")
 
     def flush(self) -> None:
         self._order(wire.Kind.FLUSH)
@@ -245,6 +281,17 @@ class ServedAttachment(BusAttachment):
             f"r2p bus serve {self._name}, and open the bus anew"
         )
 
+    def fork(self) -> None:
+        """End this copy of an attachment, in a process that was forked: the thread exists in the other one only."""
+        self._lock = threading.Lock()
+        self._changed, self._arrived = threading.Condition(self._lock), threading.Condition(self._lock)
+        self._end = self._forked
+        self._events.clear()
+        os.close(self._connection.detach())  # without an end for the other process
+
+    def _forked(self) -> Error:
+        return TransportError(f"{self.description}: this process was forked from the one that opened the bus: {_FORK}")
+
     def _check(self) -> None:
         if self._end is not None:
             raise self._end()
@@ -253,10 +300,8 @@ class ServedAttachment(BusAttachment):
         """Let all calls raise this error, once the events that have arrived are read."""
         if self._end is None or end == self._closed:
             self._end = end
-        try:
+        with contextlib.suppress(OSError):  # the server was faster
             self._connection.shutdown(socket.SHUT_RDWR)  # wakes the thread
-        except OSError:  # the server was faster
-            pass
         self._changed.notify_all()
         self._arrived.notify_all()
         self._show()
@@ -298,6 +343,17 @@ class ServedAttachment(BusAttachment):
         if self.lost and not self._warned:
             self._warned = True
             logger.warning("%s: this program reads frames too late, and loses the oldest ones", self._name)
+
+
+_attachments: weakref.WeakSet[ServedAttachment] = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    for attachment in list(_attachments):
+        attachment.fork()
+
+
+os.register_at_fork(after_in_child=_after_fork)
 
 
 def _wait(condition: threading.Condition, deadline: float | None) -> bool:

@@ -18,8 +18,8 @@ follows, at most `BODY_MAX` bytes.
 
 Identifiers have the flags EXTENDED and REMOTE above their 29 bits, as in SocketCAN; the length of a remote frame is the
 number of bytes that it asks for. `done` counts the frames of the client that have left its queue, sent or not: it sends
-at most `TX_QUEUE` beyond that. `lost` counts events that it did not read in time. `kind`: bit 0 for an own frame, 3 bits
-for the `ErrorKind` and 3 for the new `ControllerState`, both counted from 1, and 0 for none.
+at most `TX_QUEUE` beyond that. `lost` counts events that it did not read in time. `kind`: bit 0 for an own frame, 3
+bits for the `ErrorKind` and 3 for the new `ControllerState`, both counted from 1, and 0 for none.
 
 The version changes with any of this: both programs need the same one.
 """
@@ -27,9 +27,8 @@ The version changes with any of this: both programs need the same one.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -38,13 +37,16 @@ from r2p.errors import DecodeError
 from r2p.sim.buses.attachment import BusFilter, BusFrame
 from r2p.sim.can import ControllerState, ErrorKind
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
 VERSION: Final = 1
 PROOF_SIZE: Final = 16
 """Bytes of the secret that each side sends."""
 GREETING_MAX: Final = 4096
 """Bytes after the head of a greeting, at most."""
-BODY_MAX: Final = 1 << 18
-"""Bytes of a message after its head, at most: some 7700 events."""
+BODY_MAX: Final = 1 << 19
+"""Bytes of a message after its head, at most: some 15 000 events."""
 
 _MAGIC: Final = b"R2PB"
 _GREETING: Final = struct.Struct("<4sH16sH")
@@ -56,6 +58,7 @@ _EVENT: Final = struct.Struct("<IBB8sqqHH")
 
 GREETING_SIZE: Final = _GREETING.size
 HEAD_SIZE: Final = _HEAD.size
+STATUS_SIZE: Final = _STATUS.size
 EVENT_SIZE: Final = _EVENT.size
 EVENTS_MAX: Final = (BODY_MAX - _STATUS.size) // EVENT_SIZE
 """Events in a message, at most."""
@@ -85,10 +88,16 @@ class Kind(IntEnum):
 
 
 class BusDescription(msgspec.Struct, frozen=True):
-    """What a client learns of its bus at first: bit/s, and the name of its own node there."""
+    """What a client learns of its bus at first: bit/s, and the name of its own node there.
+
+    At the computer's monotonic instant `since` (ns) the bus had its instant `now`; its time goes `speed` times as fast.
+    """
 
     bitrate: int
     node: str
+    now: int
+    since: int
+    speed: float
 
 
 class Status(msgspec.Struct, frozen=True):
@@ -143,7 +152,7 @@ def decode_head(data: bytes | bytearray, offset: int = 0) -> tuple[int, int]:
 
 def encode_frames(frames: Iterable[Frame | OtherFrame]) -> bytes:
     """Return the body of SEND."""
-    return b"".join([_SENT.pack(*_parts(frame)) for frame in frames])
+    return b"".join([_SENT.pack(*parts(frame)) for frame in frames])
 
 
 def decode_frames(body: bytes) -> list[Frame | OtherFrame]:
@@ -175,7 +184,7 @@ def encode_status(status: Status) -> bytes:
 
 def encode_event(event: BusFrame) -> bytes:
     """Return one record of EVENTS."""
-    identifier, length, data = (0, 0, b"") if event.frame is None else _parts(event.frame)
+    identifier, length, data = (0, 0, b"") if event.frame is None else parts(event.frame)
     kind = event.own | _ERROR_NUMBERS[event.error] | _STATE_NUMBERS[event.state]
     return _EVENT.pack(identifier, length, kind, data, event.end, event.utc, event.tx_errors, event.rx_errors)
 
@@ -211,7 +220,7 @@ def decode_event(record: EventRecord) -> BusFrame:
     return BusFrame(frame, end, utc, bool(kind & _OWN), error, state, tx_errors, rx_errors)
 
 
-def _parts(frame: Frame | OtherFrame) -> tuple[int, int, bytes]:
+def parts(frame: Frame | OtherFrame) -> tuple[int, int, bytes]:
     """Return identifier with flags, length and data of a frame."""
     if type(frame) is Frame:
         return frame.id | EXTENDED, len(frame.data), frame.data

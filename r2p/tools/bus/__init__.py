@@ -1,13 +1,15 @@
-"""`r2p bus`: what an RTCAN bus carries, how its slots are used, and what still fits. All commands only listen.
+"""`r2p bus`: what an RTCAN bus carries, how its slots are used, and what still fits; and a simulated bus for others.
 
 `traffic` has `load`, `dump`, and how a command opens a bus; `slots` has `schedule` and `admit`, and draws the cycle.
+These only listen. `serve` runs a simulated bus.
 """
 
 from r2p.tools import session
-from r2p.tools.bus import slots, traffic
+from r2p.tools.bus import serving, slots, traffic
 
-app = session.group("Inspect an RTCAN bus: load, frames, slots.")
+app = session.group("Inspect an RTCAN bus: load, frames, slots. Serve a simulated one.")
 session.command(app, "load", opening=traffic.listen)(traffic.load)
 session.command(app, "dump", opening=traffic.listen)(traffic.dump)
 session.command(app, "schedule", opening=traffic.listen)(slots.schedule)
 app.command()(slots.admit)
+app.command("serve")(session.service(serving.serve))

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from r2p.bus import BusLoad, BusMonitor, FrameKind, SeenFrame
+from r2p.errors import TransportError
+from r2p.tools.bus.serving import SERVED
 from r2p.tools.options import Count, Format, Once, Timeout, valid_topic
 from r2p.tools.output import Output, aligned, notify
 from r2p.tools.session import Settings, UsageError, check_urls, patience
@@ -31,7 +33,7 @@ async def listen(settings: Settings) -> AsyncIterator[BusMonitor]:
     """Open the one `rtcan:` URL of the settings for listening. Raises UsageError unless there is exactly one."""
     urls = [url for url in settings.via if url.startswith("rtcan:")]
     if len(urls) != 1:
-        raise UsageError(f"give one CAN bus, as in --via rtcan:can0{_instead(urls or settings.via)}")
+        raise UsageError(f"give one CAN bus, as in --via rtcan:can0{_instead(urls or settings.via)}{_served()}")
     check_urls(urls, settings.via_source)
     async with BusMonitor(urls[0], on_status=notify) as bus:
         yield bus
@@ -39,8 +41,21 @@ async def listen(settings: Settings) -> AsyncIterator[BusMonitor]:
 
 def _instead(urls: list[str]) -> str:
     if any(url.startswith("sim:") for url in urls):
-        return "; sim: is a bus inside one program: r2p sim --bus reports its load"
+        return (
+            "; sim: is a bus inside one program: r2p sim --bus NAME lets others join it, --bus-report reports its load"
+        )
     return f" (not {' and '.join(urls)})" if urls else ""
+
+
+def _served() -> str:
+    """Say which simulated buses this user's programs serve."""
+    from r2p.sim.buses import rendezvous  # takes long to import
+
+    try:
+        urls = [SERVED + each.name for each in rendezvous.served()]
+    except TransportError:
+        return ""
+    return f"; programs serve {' and '.join(urls)}" if urls else ""
 
 
 async def load(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from r2p.sim.modules.boards import ParameterOptions
+from r2p.tools.bus.serving import checked
 from r2p.tools.options import Params, ParamsFile, Quiet, Verbose, Via, time_option
 from r2p.tools.session import UsageError, check_urls, execute, run_virtually, settings
 from r2p.tools.sim.parameters import parameter_sources
@@ -42,7 +43,12 @@ def command(
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of all random numbers.")] = 0,
     drive: _Drive = False,
-    bus: Annotated[bool, typer.Option("--bus", help="At the end, report how much each node sent on the bus.")] = False,
+    bus: Annotated[
+        str | None, typer.Option("--bus", metavar="NAME", help="Let other programs join the robot's bus by this name.")
+    ] = None,
+    bus_report: Annotated[
+        bool, typer.Option("--bus-report", help="At the end, report how much each node sent on the bus.")
+    ] = False,
     allow_control: Annotated[
         bool, typer.Option("--allow-control", help="Let the gateway accept REBOOT, BOOTLOAD and changes from IP links.")
     ] = False,
@@ -66,6 +72,8 @@ def command(
             raise UsageError("--fast is as fast as possible: leave out either --fast or --speed")
         if fast and via:
             raise UsageError("--fast runs in virtual time, so other programs can't connect: leave out --via or --fast")
+        if fast and bus:
+            raise UsageError("--fast runs in virtual time, so other programs can't join: leave out --bus or --fast")
         check_urls(via or [])
         chosen = settings()
         display = display_of(robot)
@@ -78,7 +86,8 @@ def command(
             outside=() if fast else tuple(via or default_links()),
             rounds=math.inf if drive or fast else 0,
             fast=fast,
-            bus=bus,
+            bus=checked(bus) if bus else None,
+            bus_report=bus_report,
             allow_control=allow_control,
             parameters=parameters,
         )

@@ -8,9 +8,11 @@ from typing import Any
 import r2p
 from r2p import sim
 from r2p.bridge import BridgeOptions
+from r2p.sim.buses.server import serve_bus
 from r2p.sim.modules.boards import ParameterOptions
 from r2p.sim.robots.base import EmulatedRobot
 from r2p.sim.robots.figures import FiguresReader
+from r2p.tools.bus.serving import SERVED
 from r2p.tools.output import program
 from r2p.tools.session import moments
 from r2p.tools.sim.display import RobotDisplay
@@ -42,14 +44,16 @@ async def simulate(
     outside: Iterable[str] = (),
     rounds: float = 0,
     fast: bool = False,
-    bus: bool = False,
+    bus: str | None = None,
+    bus_report: bool = False,
     allow_control: bool = False,
     parameters: ParameterOptions | None = None,
 ) -> None:
     """Run a robot and show its figures, for `duration` seconds or until cancelled.
 
     `outside`: URLs that the gateway opens. `rounds`: how often a PC drives what there is to see. `fast`: under virtual
-    time. `bus`: print bus statistics at the end. `allow_control`: the gateway accepts REBOOT, BOOTLOAD and changes.
+    time. `bus`: under which name other programs can join the robot's bus. `bus_report`: print statistics of the bus at
+    the end. `allow_control`: the gateway accepts REBOOT, BOOTLOAD and changes.
     `parameters`: what those of the modules are at first. Raises UsageError for one that no module has, or a value that
     does not fit.
     """
@@ -59,7 +63,7 @@ async def simulate(
     display = kind(f"sim:{name}", seed=seed, outside=[*outside, _INSIDE], options=bridge, parameters=parameters)
     robot = display.robot
     screen = SimulatorScreen(display, live=not fast, duration=duration)
-    async with robot, r2p.Module("PC1", via=_INSIDE, watchdog=False) as pc:
+    async with _served(can, bus), robot, r2p.Module("PC1", via=_INSIDE, watchdog=False) as pc:
         check_parameters(robot)
         screen.print(
             f"{robot.title} starts: {len(robot.modules)} modules on a simulated RTCAN bus",
@@ -71,7 +75,7 @@ async def simulate(
         display.watch(pc)
         if rounds:
             display.drive(pc, rounds=rounds)
-        screen.print_hints(*_introduction(display, driven=rounds > 0))
+        screen.print_hints(*_introduction(display, bus, driven=rounds > 0))
         pace = _FAST_LINES if fast else _REFRESH if screen.live else _LINES
         figures = reader.read(0.0)
         try:
@@ -81,8 +85,13 @@ async def simulate(
                     screen.show(figures)
         finally:  # also after Ctrl-C
             screen.print_summary(figures, fast=fast)
-            if bus:
+            if bus_report:
                 screen.print("", *bus_table(can))
+
+
+def _served(can: sim.SimCan, name: str | None) -> contextlib.AbstractAsyncContextManager[object]:
+    """Let other programs join the bus, if it has a name for them."""
+    return contextlib.nullcontext() if name is None else serve_bus(can, name)
 
 
 def addresses(robot: EmulatedRobot) -> list[str]:
@@ -94,11 +103,12 @@ def addresses(robot: EmulatedRobot) -> list[str]:
     return [*urls, *others]
 
 
-def _introduction(display: RobotDisplay[Any], *, driven: bool) -> list[str]:
+def _introduction(display: RobotDisplay[Any], bus: str | None, *, driven: bool) -> list[str]:
     """Return hints for what to do in another terminal meanwhile."""
     urls = addresses(display.robot)
-    if not urls:
-        return []
     hints = [f"topic echo odometry --via {url}" for url in urls]
-    hints += display.hints(urls[0], driven=driven)
-    return ["In another terminal:", *(f"  {program()} {hint}" for hint in hints)]
+    if urls:
+        hints += display.hints(urls[0], driven=driven)
+    if bus is not None:
+        hints.append(f"bus load --via {SERVED}{bus}")
+    return ["In another terminal:", *(f"  {program()} {hint}" for hint in hints)] if hints else []

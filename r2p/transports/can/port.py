@@ -91,6 +91,9 @@ class CanPort(abc.ABC):
     coarse: bool = False
     """True if the port can't hit an instant to a few us. Then all but hard real-time gets runs of free slots."""
 
+    listen_only: bool = False
+    """True if nothing is to be sent, no acknowledge either; set before `run`. Most ports can't do without it."""
+
     def __init__(self, name: str) -> None:
         self.name = name
         """The name as in the URL, without the scheme and options: `can0`."""

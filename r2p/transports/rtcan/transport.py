@@ -5,6 +5,7 @@ all nodes of its network share.
 """
 
 import asyncio
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -24,12 +25,12 @@ from r2p.units import SECOND
 # fmt: off
 INTERFACES = frozenset({
     "canalystii", "cantact", "etas", "gs_usb", "iscan", "ixxat", "kvaser", "neousys",
-    "neovi", "nican", "nixnet", "pcan", "robotell", "seeedstudio", "serial", "slcan",
+    "neovi", "nican", "nixnet", "pcan", "r2psim", "robotell", "seeedstudio", "serial", "slcan",
     "socketcan", "socketcand", "systec", "udp_multicast", "usb2can", "vector", "virtual",
 })
 # fmt: on
-"""python-can's interfaces by name, listed so that python-can need not be loaded. An interface of SocketCAN that has one
-of these names is `rtcan:socketcan:NAME`.
+"""python-can's interfaces by name, r2p's own included; listed so that python-can need not be loaded. An interface of
+SocketCAN that has one of these names is `rtcan:socketcan:NAME`.
 """
 
 _SLOT_MIN_COARSE = 500_000  # ns of the shortest slot that a port keeps to which can't hit an instant exactly
@@ -159,6 +160,9 @@ def from_url(url: Url) -> RtcanTransport:
 
 def _port_maker(interface: str, channel: str, options: RtcanOptions) -> Callable[[], CanPort]:
     # Imported here: SocketCAN is Linux's, and python-can takes long to load.
+    if interface == "r2psim":  # by name, as the simulation is a layer above
+        port: Callable[[str, int], CanPort] = importlib.import_module("r2p.sim.buses.port").ServedBusPort
+        return lambda: port(channel, options.bitrate)
     if interface == "socketcan":
         from r2p.transports.can.socketcan import SocketCanPort
 

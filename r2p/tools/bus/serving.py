@@ -1,0 +1,63 @@
+"""`r2p bus serve`: a simulated CAN bus for other programs."""
+
+import asyncio
+import importlib.util
+from typing import Annotated
+
+import typer
+
+from r2p.errors import TransportError
+from r2p.tools.config import UsageError
+from r2p.tools.output import notify, program
+from r2p.transports.rtcan.transport import OPTIONS
+
+SERVED = "rtcan:r2psim:"
+"""How the URLs of buses begin that programs serve."""
+
+_BITRATE = 1_000_000
+
+
+async def serve(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="What other programs call it, such as lab.")],
+    *,
+    bitrate: Annotated[str, typer.Option("--bitrate", metavar="BIT/S", help="Bit rate of the bus.")] = str(_BITRATE),
+    noise: Annotated[
+        float, typer.Option("--noise", min=0.0, max=1.0, metavar="SHARE", help="Share of frames with a bit error.")
+    ] = 0.0,
+    seed: Annotated[int | None, typer.Option("--seed", metavar="N", help="Seed of its random numbers.")] = None,
+) -> None:
+    """Run a simulated CAN bus for other programs.
+
+    It is exact to the bit: arbitration, stuff bits, error frames, bus-off. Programs of this user join by python-can's
+    interface r2psim, each as a node of its own. It runs until Ctrl-C.
+    """
+    from r2p.sim.buses.server import serve_bus  # takes long, and the other commands of this group need none of it
+    from r2p.sim.transport import SimCan
+
+    try:
+        speed = OPTIONS["bitrate"](bitrate)
+    except ValueError as error:
+        raise UsageError(f"--bitrate {bitrate}: {error}") from error
+    can = SimCan(bitrate=speed, noise=noise, seed=seed)
+    async with serve_bus(can, checked(name)):
+        notify(f"the CAN bus {name} runs, with {speed} bit/s. In other terminals:\n" + "\n".join(hints(name, speed)))
+        await asyncio.get_running_loop().create_future()
+
+
+def checked(name: str) -> str:
+    """Return the name of a bus that is to be served. Raises UsageError for one that can't be."""
+    from r2p.sim.buses.rendezvous import check_name
+
+    try:
+        return check_name(name)
+    except TransportError as error:
+        raise UsageError(str(error)) from error
+
+
+def hints(name: str, bitrate: int = _BITRATE) -> list[str]:
+    """Return what to type in other terminals to look at a bus that is served."""
+    url = SERVED + name + (f",bitrate={bitrate}" if bitrate != _BITRATE else "")
+    found = [f"{program()} bus dump --via {url}", f"{program()} bus load --via {url}"]
+    if importlib.util.find_spec("can"):
+        found += [f"python -m can.logger -i r2psim -c {name}"]
+    return [f"  {each}" for each in found]
