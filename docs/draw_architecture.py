@@ -21,6 +21,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "Simulation, boot loader, ROS": (
         "sim",
         "sim.can",
+        "sim.buses",
         "sim.modules",
         "sim.physics",
         "sim.robots",

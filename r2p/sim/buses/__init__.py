@@ -6,17 +6,28 @@ this process; one of another process, as `r2p bus serve` has it; a new one, in a
 
 from r2p.sim.buses.attachment import AttachmentOptions, BusAttachment
 from r2p.sim.buses.local import attach_here, attach_to_thread, local_channels
+from r2p.sim.buses.rendezvous import served_buses
+from r2p.sim.buses.served import connect, not_served
 
 
 def attach(channel: str, options: AttachmentOptions | None = None) -> BusAttachment:
     """Attach to the bus of that name; make it if there is none. Raises TransportError if that does not work."""
     options = options or AttachmentOptions()
-    return attach_here(channel, options) or attach_to_thread(channel, options)
+    elsewhere = options.served
+    if elsewhere is None:
+        elsewhere = channel not in local_channels()
+    if not options.served and (here := attach_here(channel, options)) is not None:
+        return here
+    if elsewhere and (attachment := connect(channel, options)) is not None:
+        return attachment
+    if options.served:
+        raise not_served(channel)
+    return attach_to_thread(channel, options)
 
 
 def channels() -> list[str]:
     """Return the names of the buses that there are."""
-    return local_channels()
+    return sorted({*local_channels(), *(each.name for each in served_buses())})
 
 
 __all__ = ["AttachmentOptions", "BusAttachment", "attach", "channels"]

@@ -14,7 +14,7 @@ from r2p.codecs.can_bits import ERROR, LOCAL, Frame, OtherFrame
 from r2p.errors import Error, TransportError
 from r2p.sim.buses import wire
 from r2p.sim.buses.attachment import AttachmentOptions, BusFilter
-from r2p.sim.buses.served import ServedAttachment, connect
+from r2p.sim.buses.served import ServedAttachment, connect, not_served
 from r2p.sim.can import ControllerState
 from r2p.transports.can.port import CanPortListener, FrameTap, InterfacePort, OpenInterface
 from r2p.transports.can.rawsocket import encode_error
@@ -54,21 +54,17 @@ class ServedBusPort(InterfacePort["_ServedInterface"]):
         backoff = Backoff(random_of(), longest=_RETRY_MAX)
         attachment = await self._connect()
         if attachment is None:
-            raise TransportError(f"rtcan:{self.name}: {self._unserved()}")
+            raise not_served(self._channel)
         self._clock = attachment.clock.now
         opened()
         while True:
             if attachment is None:
-                listener.on_waiting(self._unserved())
+                listener.on_waiting(str(not_served(self._channel)))
             else:
                 await self._serve(attachment, listener)
                 backoff.reset()
             await asyncio.sleep(backoff.delay())
             attachment = await self._connect()
-
-    def _unserved(self) -> str:
-        name = self._channel
-        return f"no program serves the bus {name}: start it with r2p bus serve {name}, or r2p sim ROBOT --bus {name}"
 
     async def _connect(self) -> ServedAttachment | None:
         """Connect in a thread, as a server may hesitate. Raises TransportError if it refuses."""
@@ -173,7 +169,7 @@ class _ServedInterface(OpenInterface):
             self._mailboxes.seen(frame.id, frame.data, event.end, self._clock.monotonic())
 
     def _hand_to_tap(self, tap: FrameTap, events: list[BusFrame]) -> None:
-        frames = [_wire_frame(event) for event in events if event.frame is not None]
+        frames = [_wire_frame(event) for event in events if event.state is None]
         if frames:
             tap.on_frames(frames, events[0].utc - events[0].end)
         if self._lost < self._attachment.lost:
@@ -182,10 +178,9 @@ class _ServedInterface(OpenInterface):
 
 
 def _wire_frame(event: BusFrame) -> WireFrame:
-    frame = event.frame
-    assert frame is not None
     if event.error is not None:
         identifier, data = encode_error(event.error.value)
-        return identifier | ERROR, data, 0, event.end
-    identifier, length, data = wire.parts(frame)
+        return identifier | ERROR, data, LOCAL * event.own, event.end
+    assert event.frame is not None
+    identifier, length, data = wire.parts(event.frame)
     return identifier, data or bytes(length), LOCAL * event.own, event.end

@@ -89,7 +89,7 @@ def find(name: str) -> ServedBus | None:
         return None
 
 
-def served() -> list[ServedBus]:
+def served_buses() -> list[ServedBus]:
     """Return the buses that programs serve now, as far as can be seen without connecting to them."""
     found = [_read(path) for path in sorted(folder().glob(f"*{_SUFFIX}"))]
     return [each for each in found if each is not None and _runs(each.pid)]

@@ -11,18 +11,19 @@ import contextlib
 import os
 import socket
 import threading
-import time
 import weakref
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from r2p.clock import SystemClock
 from r2p.errors import Closed, DecodeError, Error, TransportError
 from r2p.log_lines import get_logger
 from r2p.sim.buses import rendezvous, wire
 from r2p.sim.buses.attachment import TX_QUEUE, BusAttachment, BusFrame
 from r2p.sim.can import ControllerState
+from r2p.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -35,10 +36,8 @@ logger = get_logger("r2p.sim.buses")
 
 _ANSWER_TIMEOUT: Final = 5.0  # seconds for the server's greeting
 _CLOSE_TIMEOUT: Final = 5.0  # ... and for the thread to end
-_STALLED: Final = (
-    1.0  # seconds without a frame that leaves a full queue, until a sender that would wait forever gives up
-)
-_FORK: Final = "open buses after the fork"
+_STALLED: Final = SECOND
+"""Ns in which no frame leaves a full queue, until a sender that would wait forever gives up."""
 _BUFFER: Final = 1 << 16  # bytes read at once
 
 
@@ -66,6 +65,13 @@ def connect(channel: str, options: AttachmentOptions) -> ServedAttachment | None
         return None
     connection.settimeout(None)
     return ServedAttachment(connection, served, description, options)
+
+
+def not_served(channel: str) -> TransportError:
+    """Return the error for a bus that no program serves."""
+    return TransportError(
+        f"no program serves the bus {channel}: start it with r2p bus serve {channel}, or r2p sim ROBOT --bus {channel}"
+    )
 
 
 def _in_loop() -> bool:
@@ -117,7 +123,7 @@ class BusClock:
 
     def now(self) -> int:
         """Return the time on the bus (ns). Both processes have the computer's monotonic clock."""
-        elapsed = time.monotonic_ns() - self._since
+        elapsed = _clock.monotonic() - self._since
         return self._now + (elapsed if self.speed == 1.0 else round(elapsed * self.speed))
 
 
@@ -158,7 +164,7 @@ class ServedAttachment(BusAttachment):
     # Sending
 
     def send(self, frame: Frame | OtherFrame, timeout: float | None = None) -> None:
-        message = wire.encode_message(wire.Kind.SEND, wire.encode_frames([frame]))
+        message = wire.encode_message(wire.MessageType.SEND, wire.encode_frames([frame]))
         with self._lock:
             self._check()
             if self._listen_only:
@@ -178,27 +184,27 @@ class ServedAttachment(BusAttachment):
 
     def _wait_for_room(self, timeout: float | None) -> None:
         """Wait until the queue has room; called with the lock. Raises TimeoutError."""
-        deadline = None if timeout is None else time.monotonic() + timeout
+        deadline = _deadline(timeout)
         goes_on = True
         while goes_on and self._waiting() >= TX_QUEUE:
             done = self._status.done
-            left = _STALLED if deadline is None else deadline - time.monotonic()
-            goes_on = left > 0 and (self._changed.wait(left) or (deadline is None and done != self._status.done))
+            in_time = _wait(self._changed, _clock.monotonic() + _STALLED if deadline is None else deadline)
+            goes_on = in_time or (deadline is None and done != self._status.done)
             self._check()
         if self._waiting() >= TX_QUEUE:
             why = ": the first one fails again and again" if self._status.tx_errors else ""
             raise TimeoutError(f"{self.description}: the queue of {TX_QUEUE} frames is full{why}")
 
     def flush(self) -> None:
-        self._order(wire.Kind.FLUSH)
+        self._order(wire.MessageType.FLUSH)
 
     def restart(self) -> None:
-        self._order(wire.Kind.RESTART)
+        self._order(wire.MessageType.RESTART)
 
     def set_filters(self, filters: Sequence[BusFilter]) -> None:
-        self._order(wire.Kind.FILTERS, wire.encode_filters(filters))
+        self._order(wire.MessageType.FILTERS, wire.encode_filters(filters))
 
-    def _order(self, kind: wire.Kind, body: bytes = b"") -> None:
+    def _order(self, kind: wire.MessageType, body: bytes = b"") -> None:
         with self._lock:
             self._check()
             self._write(wire.encode_message(kind, body))
@@ -219,7 +225,7 @@ class ServedAttachment(BusAttachment):
                 return wire.decode_event(self._events.popleft())
             except IndexError:  # another thread was faster
                 pass
-        deadline = None if timeout is None else time.monotonic() + timeout
+        deadline = _deadline(timeout)
         with self._lock:
             while not self._events:
                 self._check()
@@ -290,7 +296,9 @@ class ServedAttachment(BusAttachment):
         os.close(self._connection.detach())  # without an end for the other process
 
     def _forked(self) -> Error:
-        return TransportError(f"{self.description}: this process was forked from the one that opened the bus: {_FORK}")
+        return TransportError(
+            f"{self.description}: this process was forked from the one that opened the bus: open buses after the fork"
+        )
 
     def _check(self) -> None:
         if self._end is not None:
@@ -316,7 +324,7 @@ class ServedAttachment(BusAttachment):
                     body = stream.read(size)
                     if len(body) < size:
                         break
-                    if kind == wire.Kind.EVENTS:
+                    if kind == wire.MessageType.EVENTS:
                         self._take(body)
         except (OSError, DecodeError):
             pass
@@ -345,6 +353,7 @@ class ServedAttachment(BusAttachment):
             logger.warning("%s: this program reads frames too late, and loses the oldest ones", self._name)
 
 
+_clock: Final = SystemClock()
 _attachments: weakref.WeakSet[ServedAttachment] = weakref.WeakSet()
 
 
@@ -356,7 +365,13 @@ def _after_fork() -> None:
 os.register_at_fork(after_in_child=_after_fork)
 
 
-def _wait(condition: threading.Condition, deadline: float | None) -> bool:
-    """Wait for a condition; return False after the deadline."""
-    left = None if deadline is None else deadline - time.monotonic()
-    return condition.wait(left) if left is None or left > 0 else False
+def _deadline(timeout: float | None) -> int | None:
+    return None if timeout is None else _clock.monotonic() + round(timeout * SECOND)
+
+
+def _wait(condition: threading.Condition, deadline: int | None) -> bool:
+    """Wait for a condition; return False after the deadline (ns)."""
+    if deadline is None:
+        return condition.wait()
+    left = (deadline - _clock.monotonic()) / SECOND
+    return left > 0 and condition.wait(min(left, threading.TIMEOUT_MAX))

@@ -13,13 +13,12 @@ import asyncio
 import contextlib
 import hmac
 import socket
-import time
 from collections import deque
 from typing import TYPE_CHECKING, Final, cast
 
 import msgspec
 
-from r2p.clock import clock_of, real_time
+from r2p.clock import SystemClock, clock_of, real_time
 from r2p.errors import DecodeError, Error, TransportError
 from r2p.log_lines import LineLimit, get_logger
 from r2p.sim.buses import rendezvous, wire
@@ -48,6 +47,7 @@ _STRANGERS_MAX: Final = 64  # connections that have not sent the secret yet
 _GREETING_TIMEOUT: Final = 5.0  # seconds
 _MESSAGE_MAX: Final = 4096  # bytes of a message of a client: more than TX_QUEUE frames
 _BUFFER_MAX: Final = 1 << 16  # bytes of events that wait in a connection before they wait here
+_computer: Final = SystemClock()
 
 
 class BusServer:
@@ -98,7 +98,7 @@ class BusServer:
         """Return what a client learns of the bus."""
         clock = self.can.bus.timeline.clock
         speed = clock.speed if isinstance(clock, PacedClock) else 1.0
-        now, since = clock.monotonic(), time.monotonic_ns()
+        now, since = clock.monotonic(), _computer.monotonic()
         if not clock.virtual:
             since = now  # it is the computer's, so both are the same to the nanosecond
         return wire.BusDescription(self.can.bitrate, driver.controller.name, now, since, speed)
@@ -228,13 +228,13 @@ class ServedClient(asyncio.Protocol):
 
     def _handle(self, driver: BusDriver, kind: int, body: bytes) -> None:
         match kind:
-            case wire.Kind.SEND:
+            case wire.MessageType.SEND:
                 self._send(driver, wire.decode_frames(body))
-            case wire.Kind.FILTERS:
+            case wire.MessageType.FILTERS:
                 driver.set_filters(wire.decode_filters(body))
-            case wire.Kind.FLUSH:
+            case wire.MessageType.FLUSH:
                 driver.flush()
-            case wire.Kind.RESTART:
+            case wire.MessageType.RESTART:
                 driver.restart()
             case _:
                 raise DecodeError(f"a message of unknown type {kind}")
@@ -274,7 +274,7 @@ class ServedClient(asyncio.Protocol):
         status = wire.Status(done, self._lost, driver.state, *driver.error_counters)
         body = wire.encode_status(status) + b"".join(self._waiting)
         self._waiting.clear()
-        self._transport.write(wire.encode_message(wire.Kind.EVENTS, body))
+        self._transport.write(wire.encode_message(wire.MessageType.EVENTS, body))
 
 
 @contextlib.asynccontextmanager

@@ -13,13 +13,14 @@ follows, at most `BODY_MAX` bytes.
              FILTERS  records of 9 bytes: value (u32), mask (u32), 0: 11 bits, 1: 29 bits, 2: both (u8)
              FLUSH    nothing: drop the frames that wait
              RESTART  nothing: leave bus-off
-    server   EVENTS   done (u64), lost (u64), state (u8), error counters (u16, u16), and records of 34 bytes:
-                      identifier, length, kind (u8), data, end (i64, ns), UTC (i64, ns), error counters (u16, u16)
+    server   EVENTS   done (u64), lost (u64), state (u8), error counters (u16, u16), and records of 35 bytes:
+                      identifier, length, kind (u8), place of an error (u8), data, end (i64, ns), UTC (i64, ns), error
+                      counters
 
 Identifiers have the flags EXTENDED and REMOTE above their 29 bits, as in SocketCAN; the length of a remote frame is the
 number of bytes that it asks for. `done` counts the frames of the client that have left its queue, sent or not: it sends
 at most `TX_QUEUE` beyond that. `lost` counts events that it did not read in time. `kind`: bit 0 for an own frame, 3
-bits for the `ErrorKind` and 3 for the new `ControllerState`, both counted from 1, and 0 for none.
+bits for the `ErrorKind` and 3 for the new `ControllerState`, both counted from 1; with 0 for both there is a frame.
 
 The version changes with any of this: both programs need the same one.
 """
@@ -54,7 +55,7 @@ _HEAD: Final = struct.Struct("<BI")
 _SENT: Final = struct.Struct("<IB8s")
 _FILTER: Final = struct.Struct("<IIB")
 _STATUS: Final = struct.Struct("<QQBHH")
-_EVENT: Final = struct.Struct("<IBB8sqqHH")
+_EVENT: Final = struct.Struct("<IBBB8sqqHH")
 
 GREETING_SIZE: Final = _GREETING.size
 HEAD_SIZE: Final = _HEAD.size
@@ -77,7 +78,7 @@ _STANDARD_MAX: Final = (1 << 11) - 1
 _REMOTE_MAX: Final = 15  # the length field of a frame has 4 bits
 
 
-class Kind(IntEnum):
+class MessageType(IntEnum):
     """The types of messages."""
 
     SEND = 1
@@ -137,7 +138,7 @@ def decode_greeting(data: bytes) -> Greeting:
 # Messages
 
 
-def encode_message(kind: Kind, body: bytes = b"") -> bytes:
+def encode_message(kind: MessageType, body: bytes = b"") -> bytes:
     """Return a message."""
     return _HEAD.pack(kind, len(body)) + body
 
@@ -186,7 +187,9 @@ def encode_event(event: BusFrame) -> bytes:
     """Return one record of EVENTS."""
     identifier, length, data = (0, 0, b"") if event.frame is None else parts(event.frame)
     kind = event.own | _ERROR_NUMBERS[event.error] | _STATE_NUMBERS[event.state]
-    return _EVENT.pack(identifier, length, kind, data, event.end, event.utc, event.tx_errors, event.rx_errors)
+    return _EVENT.pack(
+        identifier, length, kind, event.place, data, event.end, event.utc, event.tx_errors, event.rx_errors
+    )
 
 
 def decode_status(body: bytes) -> Status:
@@ -200,7 +203,7 @@ def decode_status(body: bytes) -> Status:
     return Status(done, lost, state, tx_errors, rx_errors)
 
 
-EventRecord = tuple[int, int, int, bytes, int, int, int, int]
+EventRecord = tuple[int, int, int, int, bytes, int, int, int, int]
 """An event as it is on the wire: cheap to keep, until `decode_event`."""
 
 
@@ -211,13 +214,12 @@ def event_records(body: bytes) -> Iterator[EventRecord]:
 
 def decode_event(record: EventRecord) -> BusFrame:
     """Return the event of a record."""
-    identifier, length, kind, data, end, utc, tx_errors, rx_errors = record
+    identifier, length, kind, place, data, end, utc, tx_errors, rx_errors = record
     if kind <= _OWN:  # most
-        return BusFrame(_frame(identifier, length, data), end, utc, kind == _OWN, None, None, tx_errors, rx_errors)
+        return BusFrame(_frame(identifier, length, data), end, utc, kind == _OWN)
     error = _ERRORS[kind >> _ERROR_SHIFT & _THREE_BITS]
     state = _STATES[kind >> _STATE_SHIFT & _THREE_BITS]
-    frame = None if state else _frame(identifier, length, data)
-    return BusFrame(frame, end, utc, bool(kind & _OWN), error, state, tx_errors, rx_errors)
+    return BusFrame(None, end, utc, bool(kind & _OWN), error, place, state, tx_errors, rx_errors)
 
 
 def parts(frame: Frame | OtherFrame) -> tuple[int, int, bytes]:

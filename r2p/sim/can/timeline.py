@@ -9,7 +9,7 @@ runs late still has its own instant, `now()`.
 from __future__ import annotations
 
 from bisect import insort
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from r2p.clock import Alarm, clock_of
 from r2p.sim.loop import VirtualLoop
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from r2p.sim.loop import Event
+
+
+_TURN: Final = 200
+"""Events in one turn of an ordinary loop: a bus that it can't keep up with is late, but leaves time for other tasks."""
 
 
 class TimelineTimer:
@@ -112,7 +116,9 @@ class Timeline:
 
     def _run_due(self, present: int) -> None:
         events = self._events
-        while events and events[0][0] <= present:
+        for _ in range(_TURN):
+            if not events or events[0][0] > present:
+                return
             when, _, callback, args = events.pop(0)
             self._now = max(self._now, when)
             callback(*args)

@@ -9,7 +9,6 @@ import typer
 from r2p.errors import TransportError
 from r2p.tools.config import UsageError
 from r2p.tools.output import notify, program
-from r2p.transports.rtcan.transport import OPTIONS
 
 SERVED = "rtcan:r2psim:"
 """How the URLs of buses begin that programs serve."""
@@ -20,7 +19,9 @@ _BITRATE = 1_000_000
 async def serve(
     name: Annotated[str, typer.Argument(metavar="NAME", help="What other programs call it, such as lab.")],
     *,
-    bitrate: Annotated[str, typer.Option("--bitrate", metavar="BIT/S", help="Bit rate of the bus.")] = str(_BITRATE),
+    bitrate: Annotated[
+        int, typer.Option("--bitrate", min=10_000, max=1_000_000, metavar="BIT/S", help="Bit rate of the bus.")
+    ] = _BITRATE,
     noise: Annotated[
         float, typer.Option("--noise", min=0.0, max=1.0, metavar="SHARE", help="Share of frames with a bit error.")
     ] = 0.0,
@@ -35,12 +36,13 @@ async def serve(
     from r2p.sim.transport import SimCan
 
     try:
-        speed = OPTIONS["bitrate"](bitrate)
+        can = SimCan(bitrate=bitrate, noise=noise, seed=seed)
     except ValueError as error:
-        raise UsageError(f"--bitrate {bitrate}: {error}") from error
-    can = SimCan(bitrate=speed, noise=noise, seed=seed)
+        raise UsageError(f"{error}: take 500000, 250000 or 125000") from error
     async with serve_bus(can, checked(name)):
-        notify(f"the CAN bus {name} runs, with {speed} bit/s. In other terminals:\n" + "\n".join(hints(name, speed)))
+        notify(
+            f"the CAN bus {name} runs, with {bitrate} bit/s. In other terminals:\n" + "\n".join(hints(name, bitrate))
+        )
         await asyncio.get_running_loop().create_future()
 
 

@@ -52,7 +52,7 @@ def _served() -> str:
     from r2p.sim.buses import rendezvous  # takes long to import
 
     try:
-        urls = [SERVED + each.name for each in rendezvous.served()]
+        urls = [SERVED + each.name for each in rendezvous.served_buses()]
     except TransportError:
         return ""
     return f"; programs serve {' and '.join(urls)}" if urls else ""

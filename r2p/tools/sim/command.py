@@ -32,6 +32,10 @@ _Drive = Annotated[bool, typer.Option("--drive", help="Let a PC drive it, to loo
 _Fast = Annotated[
     bool, typer.Option("--fast", help="As fast as possible, in virtual time; other programs can't connect.")
 ]
+_Bus = Annotated[
+    str | None, typer.Option("--bus", metavar="NAME", help="Let other programs join the robot's bus by this name.")
+]
+_BusReport = Annotated[bool, typer.Option("--bus-report", help="At the end, report what each node sent on the bus.")]
 
 
 def command(
@@ -43,12 +47,8 @@ def command(
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of all random numbers.")] = 0,
     drive: _Drive = False,
-    bus: Annotated[
-        str | None, typer.Option("--bus", metavar="NAME", help="Let other programs join the robot's bus by this name.")
-    ] = None,
-    bus_report: Annotated[
-        bool, typer.Option("--bus-report", help="At the end, report how much each node sent on the bus.")
-    ] = False,
+    bus: _Bus = None,
+    bus_report: _BusReport = False,
     allow_control: Annotated[
         bool, typer.Option("--allow-control", help="Let the gateway accept REBOOT, BOOTLOAD and changes from IP links.")
     ] = False,
@@ -68,12 +68,8 @@ def command(
     """
 
     async def main() -> None:
-        if fast and speed is not None:
-            raise UsageError("--fast is as fast as possible: leave out either --fast or --speed")
-        if fast and via:
-            raise UsageError("--fast runs in virtual time, so other programs can't connect: leave out --via or --fast")
-        if fast and bus:
-            raise UsageError("--fast runs in virtual time, so other programs can't join: leave out --bus or --fast")
+        if fast:
+            _check_fast(speed, {"--via": via, "--bus": bus})
         check_urls(via or [])
         chosen = settings()
         display = display_of(robot)
@@ -102,6 +98,17 @@ def command(
         endless=endless,
         run=virtually if fast or speed is not None else None,
     )
+
+
+def _check_fast(speed: float | None, open_to_others: dict[str, object]) -> None:
+    """Raise UsageError for options that make no sense in virtual time."""
+    if speed is not None:
+        raise UsageError("--fast is as fast as possible: leave out either --fast or --speed")
+    for option, value in open_to_others.items():
+        if value:
+            raise UsageError(
+                f"--fast runs in virtual time, so other programs can't connect: leave out {option} or --fast"
+            )
 
 
 def display_of(robot: _Name) -> "type[RobotDisplay[Any]]":

@@ -27,7 +27,7 @@ def test_a_bus_is_found_while_it_is_served(folder: Path) -> None:
     assert rendezvous.find("lab") is None
     with rendezvous.publish("lab", 1234, bitrate=500_000) as served:
         assert rendezvous.find("lab") == served
-        assert rendezvous.served() == [served]
+        assert rendezvous.served_buses() == [served]
         assert (served.name, served.port, served.pid, served.bitrate) == ("lab", 1234, os.getpid(), 500_000)
         assert len(served.secret) == rendezvous.SECRET_SIZE
         assert rendezvous.find("other") is None
@@ -93,7 +93,7 @@ with rendezvous.publish("lab", 1, bitrate=1_000_000):
     stale = rendezvous.find("lab")
     assert stale is not None
     assert stale.pid == child.pid
-    assert rendezvous.served() == []
+    assert rendezvous.served_buses() == []
     with rendezvous.publish("lab", 2, bitrate=1_000_000) as served:
         assert rendezvous.find("lab") == served
     assert rendezvous.find("lab") is None
@@ -103,7 +103,7 @@ def test_a_file_of_another_version_is_none_of_ours(folder: Path) -> None:
     rendezvous.folder()
     (folder / "lab.bus").write_text('{"port": "a word"}')
     assert rendezvous.find("lab") is None
-    assert rendezvous.served() == []
+    assert rendezvous.served_buses() == []
 
 
 def test_a_link_in_the_place_of_a_file_is_refused(folder: Path, tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def _a_file(folder: Path) -> None:
 )
 def test_folders_that_are_not_safe(folder: Path, make: Callable[[Path], None], text: str) -> None:
     make(folder)
-    for use in (rendezvous.folder, rendezvous.served, lambda: rendezvous.find("lab")):
+    for use in (rendezvous.folder, rendezvous.served_buses, lambda: rendezvous.find("lab")):
         with pytest.raises(TransportError, match=text):
             use()
 

@@ -24,8 +24,18 @@ FRAMES = st.one_of(
 NS = st.integers(-(1 << 62), 1 << 62)
 COUNTERS = st.integers(0, 0xFFFF)
 EVENTS = st.one_of(
+    st.builds(BusFrame, FRAMES, NS, NS, st.booleans()),
     st.builds(
-        BusFrame, FRAMES, NS, NS, st.booleans(), st.none() | st.sampled_from(ErrorKind), st.none(), COUNTERS, COUNTERS
+        BusFrame,
+        st.none(),
+        NS,
+        NS,
+        st.booleans(),
+        st.sampled_from(ErrorKind),
+        st.integers(0, 0xFF),
+        st.none(),
+        COUNTERS,
+        COUNTERS,
     ),
     st.builds(
         BusFrame,
@@ -34,6 +44,7 @@ EVENTS = st.one_of(
         NS,
         st.just(False),
         st.none(),
+        st.just(0),
         st.sampled_from(ControllerState),
         COUNTERS,
         COUNTERS,
@@ -100,4 +111,4 @@ def test_sizes_that_are_not() -> None:
 def test_a_message_of_the_largest_size_is_accepted() -> None:
     events = wire.EVENTS_MAX * wire.EVENT_SIZE
     body = wire.encode_status(STATUS) + bytes(events)
-    assert wire.decode_head(wire.encode_message(wire.Kind.EVENTS, body)) == (wire.Kind.EVENTS, len(body))
+    assert wire.decode_head(wire.encode_message(wire.MessageType.EVENTS, body)) == (wire.MessageType.EVENTS, len(body))

@@ -198,7 +198,7 @@ def test_the_map_grows_with_the_way() -> None:
 
 
 def test_fast_prints_a_line_each_ten_seconds_and_sums_up(capsys: pytest.CaptureFixture[str]) -> None:
-    sim.run(simulate(Triskar2Display, duration=20.0, seed=4, rounds=1, fast=True, bus=True), seed=4)
+    sim.run(simulate(Triskar2Display, duration=20.0, seed=4, rounds=1, fast=True, bus_report=True), seed=4)
     fast = capsys.readouterr().out
     lines = fast.splitlines()
     assert max(len(line) for line in lines) <= 80
