@@ -29,7 +29,7 @@ from r2p.codecs.can_bits import (
 )
 from r2p.codecs.rtcan import Frame, OtherFrame, encode_sync
 from r2p.errors import MessageError
-from tests.can_reference import on_the_bus, wire
+from tests.can_reference import crc15, on_the_bus, wire
 
 identifiers = st.integers(0, (1 << 29) - 1)
 frame_data = st.binary(max_size=8)
@@ -131,6 +131,19 @@ def test_every_kind_of_frame_on_the_wire(frame: AnyFrame) -> None:
     bits = wire(frame, acknowledged=False)
     assert wire_bits(frame) == bits
     assert other_frame_bits(frame) == len(bits)
+
+
+def test_the_check_value_of_the_crc() -> None:
+    """CRC-15/CAN in the catalogue of parametrised CRC algorithms: that of the digits 1 to 9 is 0x059E."""
+    assert int(crc15("".join(f"{byte:08b}" for byte in b"123456789")), 2) == 0x059E
+
+
+@given(any_frames())
+def test_lengths_as_data_sheets_have_them(frame: AnyFrame) -> None:
+    """44 + 8 N bits or 64 + 8 N, without stuff bits, of which there is one in four at most (Davis et al., 2007)."""
+    size = 8 * len(frame.data)
+    plain = (64 if frame.extended else 44) + size
+    assert plain <= other_frame_bits(frame) <= plain + ((54 if frame.extended else 34) + size - 1) // 4
 
 
 @given(any_frames(), any_frames())
