@@ -9,7 +9,7 @@ import msgspec
 from rich.text import Text
 
 import r2p
-from r2p.msg import Float32, Tilt, TiltRate, Velocity3
+from r2p.msg import Float32, Tilt, Velocity3
 from r2p.sim.robots.base import RobotOptions
 from r2p.sim.robots.figures import OdometryCheck, OdometryFigures, WheelFigures
 from r2p.sim.robots.tiltone.robot import MOTORS, TiltOne
@@ -174,7 +174,6 @@ class TiltOneDisplay(RobotDisplay[TiltOneFigures]):
         """Receive what the robot is told and how it is to lean, and shoves."""
         self._wanted = Latest(node, "tilt_setpoint", Tilt, fresh=FRESH)
         self._command = Latest(node, "velocity", Velocity3, fresh=FRESH)
-        node.subscribe("tilt", TiltRate, lambda _tilt: None, queue=1, lossy=True)  # it goes over the bus, as in a robot
         node.subscribe("shove", Float32, lambda shove: self._shove(shove.data))
         while True:
             await node.spin()

@@ -7,6 +7,7 @@ import pytest
 from r2p.sim.physics.motor import (
     Axle,
     BatterySpec,
+    Drive,
     Gains,
     LeadBattery,
     Motor,
@@ -230,3 +231,30 @@ def test_a_regulated_current_gives_its_torque_at_any_speed_that_the_supply_reach
     motor.regulated = 50.0
     motor.torque_at(0.0)
     assert motor.current == motor.current_limit
+
+
+def test_a_drive_sets_a_voltage_or_a_torque_and_brakes_without_one() -> None:
+    load = axle()
+    drive = Drive(load.motor, Gains(0.0, limit=5.0), mode="voltage")
+    drive.step(DT)
+    assert load.motor.voltage == 0.0
+    drive.setpoint = 9.0
+    drive.step(DT)
+    assert load.motor.voltage == 5.0
+    drive = Drive(load.motor, mode="torque")
+    drive.setpoint = 0.5  # Nm
+    drive.step(DT)
+    load.step(DT)
+    assert load.motor.speed == pytest.approx(0.5 / load.inertia * DT)
+    drive.stop()
+    drive.step(DT)
+    load.step(DT)
+    assert (load.motor.voltage, load.motor.regulated) == (0.0, None)
+    assert load.motor.current < 0.0  # it brakes
+
+
+def test_a_measured_slope_takes_the_place_of_the_difference() -> None:
+    pid = Pid(Gains(kp=0.0, kd=2.0))
+    assert pid.step(0.0, 1.0, 0.1, 3.0) == -6.0
+    assert pid.step(0.0, 5.0, 0.1, 0.0) == 0.0
+    assert pid.step(0.0, 6.0, 0.1) == pytest.approx(-20.0)

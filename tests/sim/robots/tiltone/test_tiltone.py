@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import inspect
 import math
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from r2p.sim.modules.boards import ParameterOptions
 from r2p.sim.robots.tiltone import nodes
 from r2p.sim.robots.tiltone.robot import MOTORS, ControlInput, TiltOne
 from r2p.testing.network import node_in
+from r2p.tools.run import load
 from r2p.transports.memory import Datagram, network
 from tests.sim.robots.rig import odometry_of
 from tests.sim.robots.tiltone.rig import VIA, Rider, standing
@@ -230,6 +232,39 @@ def test_the_same_seed_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> 
     assert len(one) > 500
     assert one == same
     assert one != other
+
+
+@pytest.mark.parametrize(("name", "topic"), [("velocity_control", "tilt_setpoint"), ("balance_control", "effort")])
+async def test_its_own_nodes_are_short_and_run_anywhere(name: str, topic: str) -> None:
+    (program,) = load([f"r2p.sim.robots.tiltone.nodes:{name}=node"])
+    assert len(inspect.getsource(program.function).splitlines()) < 60
+    async with r2p.Module("PC1") as module:
+        node = module.start(program.function, name=program.name)
+        await asyncio.sleep(1)
+        (publisher,) = node.publishers
+        assert (publisher.topic, publisher.publisher_class) == (topic, r2p.PublisherClass.PERIODIC)
+        assert publisher.sent == 0  # without a tilt
+
+
+@pytest.mark.parametrize(
+    ("spec", "names"),
+    [
+        (nodes.GEARED, {"voltage_limit", "current_limit", "timeout", "encoder_period"}),
+        (nodes.TORQUE, {"current_limit", "timeout", "encoder_period"}),
+    ],
+    ids=["geared", "torque"],
+)
+async def test_a_motor_module_without_a_loop_has_no_gains(spec: nodes.BalanceSpec, names: set[str]) -> None:
+    options = ParameterOptions(params={"MOTOR1": {"motor.current_limit": 7.0}})
+    async with TiltOne(VIA, spec=spec, modules=["MOTOR1"], parameters=options) as robot:
+        await asyncio.sleep(0.1)
+        infos = robot.modules["MOTOR1"].parameters.infos()
+        assert {info.name for info in infos if info.node == "motor"} == names
+        assert robot.hardware.motors[0].current_limit == 7.0
+        if spec is nodes.GEARED:
+            robot.hardware.drives[0].setpoint = 30.0
+            await asyncio.sleep(0.01)
+            assert robot.hardware.motors[0].voltage == 24.0
 
 
 def test_an_age_survives_that_its_stamp_wraps_around() -> None:
