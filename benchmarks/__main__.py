@@ -31,6 +31,7 @@ ALL = (
     "start",
     "socketcan",
     "frames",
+    "served_can",
 )
 
 

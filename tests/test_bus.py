@@ -215,6 +215,7 @@ def test_an_invalid_topic_is_a_usage_error() -> None:
         ([], "rtcan:can0$"),
         (["memory:lab"], r"\(not memory:lab\)"),
         (["rtcan:can0", "rtcan:can1"], r"\(not rtcan:can0 and rtcan:can1\)"),
+        (["r2psim:lab"], r"did you mean rtcan:r2psim:lab\?$"),
         (["sim:lab"], "sim: is a bus inside one program: r2p sim --bus NAME"),
     ],
 )

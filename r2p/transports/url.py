@@ -45,6 +45,7 @@ _IP = frozenset({*ROS, "tcp", "tcp-listen", "zenoh"})
 
 _OPTIONS = re.compile(r"[?,&]")
 _CAN = re.compile(r"[a-z]*can[0-9]+")
+_CAN_INTERFACES = ("r2psim", "slcan", "socketcan")  # of RTCAN's URLs: rtcan:slcan:/dev/ttyACM0
 _CLOSE = 0.65  # how alike a name must be to be suggested (difflib): can and rtcan are 0.75
 
 
@@ -157,7 +158,9 @@ def _factory(url: Url) -> Callable[[Url], Transport]:
             return cast("Callable[[Url], Transport]", entry.load())
     known = schemes()
     close = difflib.get_close_matches(url.scheme, known, n=1, cutoff=_CLOSE)
-    if not close and url.address.isdecimal():  # HOST:PORT alone
+    if url.scheme in _CAN_INTERFACES:
+        hint = f"; did you mean rtcan:{url}?"
+    elif not close and url.address.isdecimal():  # HOST:PORT alone
         hint = f"; did you mean tcp:{url}?"
     else:
         hint = "".join(f"; did you mean {scheme}:{url.address}?" for scheme in close)

@@ -61,6 +61,8 @@ def test_an_unknown_scheme_lists_the_known_ones() -> None:
         ("10.0.0.5:23", "tcp:10.0.0.5:23"),
         ("robot:2323", "tcp:robot:2323"),
         ("/dev/ttyUSB0", "serial:/dev/ttyUSB0"),
+        ("r2psim:lab", "rtcan:r2psim:lab"),
+        ("slcan:/dev/ttyACM0", "rtcan:slcan:/dev/ttyACM0"),
     ],
 )
 def test_what_was_meant(text: str, meant: str) -> None:

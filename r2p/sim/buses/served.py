@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from r2p.sim.buses.attachment import AttachmentOptions, BusFilter
     from r2p.sim.buses.rendezvous import ServedBus
 
-logger = get_logger("r2p.sim.buses")
+logger = get_logger("r2p.buses")
 
 _ANSWER_TIMEOUT: Final = 5.0  # seconds for the server's greeting
 _CLOSE_TIMEOUT: Final = 5.0  # ... and for the thread to end

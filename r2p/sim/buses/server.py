@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from r2p.sim.buses.attachment import BusFrame
     from r2p.sim.transport import SimCan
 
-logger = get_logger("r2p.sim.buses")
+logger = get_logger("r2p.buses")
 
 CLIENTS_MAX: Final = 64
 """Programs that use a bus at once, at most."""

@@ -44,6 +44,8 @@ def _instead(urls: list[str]) -> str:
         return (
             "; sim: is a bus inside one program: r2p sim --bus NAME lets others join it, --bus-report reports its load"
         )
+    if len(urls) == 1 and urls[0].startswith("r2psim:"):
+        return f"; did you mean rtcan:{urls[0]}?"
     return f" (not {' and '.join(urls)})" if urls else ""
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import subprocess
 import sys
+import threading
 from typing import TYPE_CHECKING
 
 import pytest
 from typer.testing import CliRunner
 
-from r2p.codecs.can_bits import Frame
+from r2p.codecs.can_bits import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.sim.buses import rendezvous
 from r2p.sim.buses.attachment import AttachmentOptions
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
 PATIENCE = 30.0  # seconds
 FORKING = """
 import os
-from r2p.codecs.can_bits import Frame
+from r2p.codecs.can_bits import Frame, OtherFrame
 from r2p.sim.buses import attach
 a, b = attach("lab"), attach("lab")
 if not (child := os.fork()):
@@ -113,6 +115,24 @@ def test_a_program_that_forks_has_a_bus_in_the_parent_only() -> None:
     child_said, parent_received = done.stdout.splitlines()
     assert "this process was forked from the one that opened the bus: open buses after the fork" in child_said
     assert parent_received == "Frame(id=1, data=b'')"
+
+
+@pytest.mark.processes
+def test_python_can_s_own_logger_joins() -> None:
+    command = [sys.executable, "-u", "-m", "can.logger", "-i", "r2psim", "-c", "lab"]
+    with process("bus", "serve", "lab") as child:
+        wait_until_served(child, "runs")
+        with (
+            contextlib.closing(attached()) as a,
+            subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as logger,
+        ):
+            limit = threading.Timer(PATIENCE, logger.kill)
+            limit.start()
+            a.send(OtherFrame(0x123, b"hello"))  # sent again and again, until it is acknowledged
+            assert logger.stdout is not None
+            assert any("68 65 6c 6c 6f" in line for line in logger.stdout)
+            limit.cancel()
+            logger.kill()
 
 
 @pytest.mark.processes
