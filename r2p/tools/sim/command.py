@@ -19,10 +19,14 @@ if TYPE_CHECKING:
 
 _FAST = 60.0  # seconds
 
-_Name = Literal["triskar2", "tiltone"]
-_DISPLAYS: dict[_Name, str] = {"triskar2": "Triskar2Display", "tiltone": "TiltOneDisplay"}
+_Name = Literal["triskar2", "robocom", "tiltone"]
+_DISPLAYS: dict[_Name, str] = {
+    "triskar2": "Triskar2Display",
+    "robocom": "RobocomDisplay",
+    "tiltone": "TiltOneDisplay",
+}
 """The display of each robot, in a module with its name."""
-_ROBOTS = "Of the thesis: triskar2, on omni wheels; tiltone, which balances on two."
+_ROBOTS = "Of the thesis: triskar2, on omni wheels; robocom, for sensor fusion; tiltone, which balances."
 
 _Speed = Annotated[
     float | None,

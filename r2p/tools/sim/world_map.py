@@ -1,15 +1,16 @@
 """A map of the world in characters, for a terminal."""
 
 import math
+from collections.abc import Iterable
 
 from rich.text import Text
 
-from r2p.sim.physics.world import Triple, Wall, World
+from r2p.sim.physics.world import Point, Triple, Wall, World
 
 _ASPECT = 2.0  # a character is twice as high as wide
 _MARGIN = 0.3  # m around walls and path
 _EXTENT_MIN = 2.0  # m
-_WALL, _PATH = "#", "."
+_WALL, _PATH, _MARK = "#", ".", "+"
 _ARROWS = ">^<v"
 
 
@@ -22,8 +23,8 @@ class WorldMap:
         self._height = height
         self._path: set[tuple[float, float]] = set()
 
-    def draw(self, pose: Triple) -> str:
-        """Return the map with the robot at this pose, which is added to the path."""
+    def draw(self, pose: Triple, marks: Iterable[Point] = ()) -> str:
+        """Return the map with the robot at this pose, which is added to the path, and marks under the path."""
         x, y, heading = pose
         self._path.add((round(x, 1), round(y, 1)))
         points = [*self._path, *(point for wall in self._world.walls for point in wall)]
@@ -39,6 +40,8 @@ class WorldMap:
             if 0 <= column < self._width and 0 <= row < self._height:
                 cells[row][column] = sign
 
+        for px, py in marks:
+            put(px, py, _MARK)
         for px, py in self._path:
             put(px, py, _PATH)
         for wall in self._world.walls:
@@ -58,5 +61,6 @@ def coloured(drawing: str) -> Text:
     """Return a map in colours."""
     text = Text(drawing, style="green")
     text.highlight_regex("#+", "dim default")
+    text.highlight_regex(r"\+", "cyan")
     text.highlight_regex(r"[<>^v]", "bold yellow")
     return text

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, Unpack
 
 import msgspec
 
+import r2p
 from r2p.clock import clock_of
-from r2p.msg import IMURaw9, Speed2
+from r2p.msg import IMURaw9, Speed2, StampedPose3, Timestamp
 from r2p.sim.modules import stamped
 from r2p.sim.modules.boards import MotorConfig, MotorModule, Plant, PowerModule
 from r2p.sim.modules.sensors import ImuModule, InertialUnit, Motion
@@ -44,6 +45,7 @@ MODULES = (*MOTORS, "IMU1", "PS", "GW")
 
 _DRIFT = 20.0  # ppm, one sigma: crystals
 _FIELD = (220.0, -400.0)  # mgauss, to the north and up
+_TRUTH = 0.1  # s
 _ELECTRONICS = 2.5  # A: modules and computer
 
 
@@ -131,6 +133,7 @@ def _rounded(gains: Gains) -> Gains:
 class Robocom(EmulatedRobot):
     """The robot, on the network `via`, for the time of an `async with` block.
 
+    With `truth` the gateway publishes where the robot really is, on `truth`: a node that no real robot has.
     `interrupts` are those of its modules, on a simulated bus (`sim:NAME`). `RobotOptions` has the rest. Raises
     InvalidName for a module that the robot does not have, and TransportError for an invalid `via`.
     """
@@ -144,6 +147,7 @@ class Robocom(EmulatedRobot):
         *,
         seed: object = 0,
         gps: GpsSpec | None = None,
+        truth: bool = False,
         interrupts: InterruptLatency = InterruptLatency(),  # noqa: B008 - a frozen value
         **options: Unpack[RobotOptions],
     ) -> None:
@@ -164,7 +168,7 @@ class Robocom(EmulatedRobot):
             "PS": BoardPlan(
                 self._power_supply, {"battery": functools.partial(triskar2.battery_monitor, spec=nodes.BATTERY)}
             ),
-            "GW": BoardPlan(self.make_gateway),
+            "GW": BoardPlan(self.make_gateway, {"truth": self._truth} if truth else {}),
         }
         super().__init__(via, hardware.plant, boards, **options)
 
@@ -173,6 +177,14 @@ class Robocom(EmulatedRobot):
         """The true pose: x and y in m, heading in rad, since the start."""
         body = self.hardware.body
         return body.x, body.y, body.w
+
+    async def _truth(self, node: r2p.Node) -> None:
+        """Publish the true pose, sampled with the encoders and the inertial sensors."""
+
+        def stamp(time: Timestamp, pose: Triple) -> StampedPose3:
+            return StampedPose3(time, *pose)
+
+        await stamped.publish_together(node, "truth", StampedPose3, _TRUTH, lambda: self.pose, stamp)
 
     def _link(self, name: str) -> str | Transport:
         """Return the link of a module: on a simulated bus with its own clock and interrupts."""

@@ -1,0 +1,57 @@
+"""What Robocom is for: samples that belong together, and a recording of them that a sensor-fusion program reads."""
+
+from __future__ import annotations
+
+import asyncio
+import runpy
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+import r2p
+from r2p.sim.robots.robocom.alignment import alignment
+from r2p.sim.robots.robocom.nodes import eight
+from r2p.sim.robots.robocom.robot import InterruptLatency, Robocom
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+pytestmark = pytest.mark.virtual_time
+
+FUSION = Path(__file__).parents[3] / "examples" / "fusion.py"
+VIA = "memory:robot"
+
+
+async def test_joined_estimates_are_better_than_each_alone(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    async with Robocom(VIA, seed=2, truth=True) as robot, r2p.Module("PC1", via=VIA) as pc:
+        await robot.ready(10)
+        async with r2p.Recorder(pc, tmp_path / "drive.mcap"):
+            await asyncio.sleep(2)
+            pc.start(eight)
+            await asyncio.sleep(60)
+        assert robot.hardware.body.path > 30
+    fuse: Callable[[str], dict[str, float]] = runpy.run_path(str(FUSION))["fuse"]
+    error = fuse(str(tmp_path / "drive.mcap"))
+    assert error["all three"] < 0.8 * min(error["encoders"], error["GPS"])
+    assert error["all three"] < error["encoders and gyroscope"] + 0.3
+    assert 0.5 < error["GPS"] < 1.5
+
+
+async def test_the_bus_itself_does_not_misalign_samples() -> None:
+    """Without a delay of the modules' software, the end of the sync is one instant, and stamps are exact."""
+    left, imu, stamp, ticks, arrival = await alignment(InterruptLatency(0.0, 0.0), seconds=2.0)
+    assert max(left.most, imu.most, stamp.most, ticks.most) < 0.1
+    assert 100 < arrival.mean < 25_000
+
+
+async def test_what_is_left_is_the_jitter_of_interrupts() -> None:
+    """That of the master, which sends the sync, and that of each module."""
+    left, imu, stamp, ticks, arrival = await alignment(seconds=2.0)
+    assert 1.0 < left.mean < left.most <= 6.0
+    assert 1.0 < imu.mean < imu.most <= 6.0
+    assert stamp.most <= 6.5
+    assert ticks.most < 6.0
+    assert str(left).startswith("left and right encoder ")
+    assert arrival.most > 100
