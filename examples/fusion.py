@@ -11,6 +11,7 @@ import math
 import operator
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import r2p
 from r2p.msg import StampedEncoder, StampedGPS, StampedIMURaw9, StampedPose3
@@ -65,12 +66,16 @@ class Filter:
 
 
 def dot(a: Sequence[float], b: Sequence[float]) -> float:
-    return sum(map(operator.mul, a, b))
+    return math.fsum(map(operator.mul, a, b))
 
 
 def read(path: str) -> list[tuple[int, r2p.Message, str]]:
     """Return all measurements by the instants at which they were taken (ns)."""
-    topics = {"imu_raw": StampedIMURaw9, "encoder_left": StampedEncoder, "encoder_right": StampedEncoder}
+    topics: dict[str, Any] = {
+        "imu_raw": StampedIMURaw9,
+        "encoder_left": StampedEncoder,
+        "encoder_right": StampedEncoder,
+    }
     topics |= {"gps": StampedGPS, "truth": StampedPose3}
     with r2p.Bag(path) as bag:
         found = [
