@@ -35,6 +35,7 @@ from r2p.tools import doctor
 from r2p.tools.main import app
 from r2p.tools.session import Settings, join
 from r2p.tools.sim import run
+from r2p.tools.sim.robocom import RobocomDisplay
 from r2p.tools.sim.run import simulate
 from r2p.tools.sim.screen import SimulatorScreen
 from r2p.tools.sim.tiltone import TiltOneDisplay
@@ -161,7 +162,7 @@ def _chunk(classes: str, column: int, row: int, text: str) -> str:
 
 def pictures() -> dict[str, str]:
     """Return all pictures by their file names."""
-    screens = _beside_the_robot() | _balancing() | {"doctor": _doctor()}
+    screens = _beside_the_robot() | _balancing() | _fusing() | {"doctor": _doctor()}
     screens["admit"], slots = _admit()
     return {f"{name}.svg": draw(screen) for name, screen in screens.items()} | {"slots.svg": slots}
 
@@ -235,6 +236,23 @@ async def _tiltone() -> dict[str, Screen]:
         robot.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await robot
+    return screens
+
+
+def _fusing() -> dict[str, Screen]:
+    with _terminal(), patch.object(run, "addresses", lambda _robot: [_ADDRESS]):
+        return sim.run(_robocom, seed=1)
+
+
+async def _robocom() -> dict[str, Screen]:
+    """Robocom, on its second circle."""
+    screens: dict[str, Screen] = {}
+
+    def show(screen: SimulatorScreen, figures: RobotFigures) -> None:
+        screens["robocom"] = _frame(screen, figures, COLUMNS, 24, "r2p sim robocom --drive")
+
+    with patch.object(SimulatorScreen, "show", show):
+        await simulate(RobocomDisplay, duration=20.0, outside=[_OUTSIDE], rounds=1)
     return screens
 
 
