@@ -162,7 +162,7 @@ class RobocomDisplay(RobotDisplay[RobocomFigures]):
         return lines
 
     def hints(self, url: str, *, driven: bool) -> list[str]:
-        record = f"bag record drive.mcap --via {url}"
+        record = f"bag record -a -o drive.mcap --via {url}"
         return [record] if driven else [f"topic pub velocity x=0.3 -r 20 --via {url}", record]
 
 

@@ -90,5 +90,5 @@ async def test_it_fits_a_terminal_of_80_columns_and_24_lines() -> None:
 
 async def test_hints_are_to_record_and_to_drive() -> None:
     display = RobocomDisplay("memory:robot", seed=1)
-    assert display.hints("tcp:HOST:1", driven=True) == ["bag record drive.mcap --via tcp:HOST:1"]
+    assert display.hints("tcp:HOST:1", driven=True) == ["bag record -a -o drive.mcap --via tcp:HOST:1"]
     assert display.hints("tcp:HOST:1", driven=False)[0].startswith("topic pub velocity ")
