@@ -1,10 +1,8 @@
 """Where was the robot? An extended Kalman filter joins encoders, gyroscope and GPS of a recording of Robocom.
 
-All of them are stamped in the time of the robot's bus, so nothing has to be aligned: sort by stamp, and go through.
-
-    r2p sim robocom --drive --via tcp-listen:2323
-    r2p bag record -a -o drive.mcap --max-duration 60s --via tcp:127.0.0.1:2323
-    python fusion.py drive.mcap
+All of them are stamped in the time of the robot's bus: sort by stamp, and go through. In two terminals:
+r2p sim robocom --drive --via tcp-listen:2323
+r2p bag record -a -o drive.mcap --max-duration 60s --via tcp:127.0.0.1:2323; python fusion.py drive.mcap
 """
 
 import math
