@@ -23,6 +23,16 @@ faults on demand, and with nodes for the test itself:
             imu.start(blink)
             assert (await leds.fetch(timeout=5)).value == 1
 
+The fixture `exact_bus` is a CAN bus in software, exact to the bit (`r2p.testing.exact_bus.ExactBus`), for programs that
+use python-can: with arbitration, error frames, and faults on demand. It works in ordinary tests, too, in real time:
+
+    def test_a_disturbed_frame_is_sent_again(exact_bus: ExactBus) -> None:
+        motor, panel = exact_bus.open("motor"), exact_bus.open("panel")
+        exact_bus.disturb_next(sender=motor)
+        motor.send(can.Message(arbitration_id=0x123))
+        assert panel.recv(1.0).arbitration_id == 0x123
+        assert len(exact_bus.errors) == 1
+
 `r2p.testing.play` plays a recording to nodes, under virtual time and by the clock of the recording:
 
     @pytest.mark.virtual_time

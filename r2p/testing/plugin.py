@@ -1,4 +1,4 @@
-"""The pytest plugin behind `@pytest.mark.virtual_time` and the fixture `r2p_network` (see `r2p.testing`).
+"""The pytest plugin behind `@pytest.mark.virtual_time`, `r2p_network` and `exact_bus` (see `r2p.testing`).
 
 pytest loads it in every session of an environment that has r2p: so it imports r2p only when a test needs it.
 """
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Coroutine, Generator, Iterator
 
+    from r2p.testing.exact_bus import ExactBus
     from r2p.testing.network import Network
 
     AsyncFunction = Callable[..., Coroutine[Any, Any, object]]
@@ -35,6 +36,18 @@ def r2p_network() -> Network:
     return Network()
 
 
+@pytest.fixture
+def exact_bus(request: pytest.FixtureRequest) -> Iterator[ExactBus]:
+    """A CAN bus of this test, exact to the bit, for programs that use python-can."""
+    try:
+        from r2p.testing.exact_bus import ExactBus
+    except ImportError:
+        pytest.fail("the fixture exact_bus needs python-can: pip install 'r2p[can]'", pytrace=False)
+    bus = ExactBus(virtual=_is_virtual(request.node))
+    yield bus
+    bus.close()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """Run a marked async test; leave other tests to pytest."""
@@ -43,7 +56,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     if marker is None:
         return None
     hypothesis = getattr(pyfuncitem.obj, "hypothesis", None)
-    test = _async_function(pyfuncitem.obj if hypothesis is None else hypothesis.inner_test)
+    test = _test_function(pyfuncitem.obj)
     if test is None:
         return None
     if marker.args or not marker.kwargs.keys() <= {"seed", "limit"}:
@@ -80,10 +93,17 @@ def pytest_pyfunc_call_unmarked(pyfuncitem: pytest.Function) -> Generator[None, 
     )
 
 
+def _is_virtual(test: pytest.Item) -> bool:
+    """Return whether a test runs under virtual time."""
+    marked = test.get_closest_marker("virtual_time") is not None
+    return marked and isinstance(test, pytest.Function) and _test_function(test.obj) is not None
+
+
 def _uses_r2p(test: pytest.Function) -> bool:
     """Return whether the test uses the fixture of this plugin, or its module anything of r2p."""
     names = (getattr(each, "__module__", None) or getattr(each, "__name__", "") for each in vars(test.module).values())
-    return "r2p_network" in test.fixturenames or any(str(name).partition(".")[0] == "r2p" for name in names)
+    fixtures = {"r2p_network", "exact_bus"}.intersection(test.fixturenames)
+    return bool(fixtures) or any(str(name).partition(".")[0] == "r2p" for name in names)
 
 
 @pytest.hookimpl
@@ -133,6 +153,12 @@ def _entries(trace: TracebackType | None) -> Iterator[TracebackType]:
     while trace is not None:
         yield trace
         trace = trace.tb_next
+
+
+def _test_function(function: object) -> AsyncFunction | None:
+    """Return the async function of a test, or None for an ordinary one."""
+    hypothesis = getattr(function, "hypothesis", None)
+    return _async_function(function if hypothesis is None else hypothesis.inner_test)
 
 
 def _async_function(function: object) -> AsyncFunction | None:

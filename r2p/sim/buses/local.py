@@ -159,6 +159,8 @@ class LocalAttachment(BusAttachment):
     def close(self) -> None:
         with self._room:
             if self._ended is not None:
+                if self._ready is not None:  # the loop has ended before
+                    self._ready.close()
                 return
             self._ended = "closed"
         _attachments.discard(self)
@@ -311,6 +313,7 @@ class _Readiness:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._set = False
+        self._closed = False
         self._reader, self._writer = socket.socketpair()
         self._reader.setblocking(False)
 
@@ -322,7 +325,7 @@ class _Readiness:
         if self._set:
             return  # a reader that is about to clear it looks at its queue after that
         with self._lock:
-            if not self._set:
+            if not self._closed and not self._set:
                 self._set = True
                 self._writer.send(b"\0")
 
@@ -330,13 +333,15 @@ class _Readiness:
         """Make it unreadable if there is nothing to read."""
         if self._set and empty():
             with self._lock:
-                if self._set and empty():  # type: ignore[redundant-expr] # another thread may have cleared it
+                if not self._closed and self._set and empty():  # type: ignore[redundant-expr] # by another thread
                     self._reader.recv(1)
                     self._set = False
 
     def close(self) -> None:
-        self._reader.close()
-        self._writer.close()
+        with self._lock:
+            self._closed = True
+            self._reader.close()
+            self._writer.close()
 
 
 class BusThread:
