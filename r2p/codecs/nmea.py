@@ -147,7 +147,10 @@ class NmeaReader:
             return None
         whole = _WHOLE.match(line)
         if whole is None:
-            self._drop(_reason(line))
+            if line[0] != _START:
+                self._drop("garbage")
+            else:
+                self._drop("cut short" if b"*" not in line[-3:-2] else "bad field")
             return None
         if checksum(line[1:-3]) != int(whole[4], 16):
             self._drop("checksum")
@@ -164,12 +167,6 @@ class NmeaReader:
 
     def _drop(self, reason: str) -> None:
         self.drops[reason] = self.drops.get(reason, 0) + 1
-
-
-def _reason(line: bytes) -> str:
-    if line[0] != _START:
-        return "garbage"
-    return "cut short" if b"*" not in line[-3:-2] else "bad field"
 
 
 # Fields to text
