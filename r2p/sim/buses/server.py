@@ -43,6 +43,7 @@ EVENTS_KEPT: Final = 8192
 
 _NAME_MAX: Final = 64  # characters
 _HOST: Final = "127.0.0.1"
+_BACKLOG: Final = 1024  # connections that the kernel keeps until the loop has time: beyond, clients wait a second
 _STRANGERS_MAX: Final = 64  # connections that have not sent the secret yet
 _GREETING_TIMEOUT: Final = 5.0  # seconds
 _MESSAGE_MAX: Final = 4096  # bytes of a message of a client: more than TX_QUEUE frames
@@ -287,12 +288,12 @@ async def serve_bus(can: SimCan, name: str) -> AsyncIterator[BusServer]:
     if getattr(clock_of(), "virtual", False) and not getattr(clock_of(), "paced", False):
         raise Error(f"virtual time does not wait for other programs, so it can't serve the bus {name}: give it a speed")
     with contextlib.ExitStack() as stack:
-        listening = stack.enter_context(socket.create_server((_HOST, 0), backlog=_STRANGERS_MAX))
+        listening = stack.enter_context(socket.create_server((_HOST, 0), backlog=_BACKLOG))
         port, bitrate = listening.getsockname()[1], can.bitrate
         served = stack.enter_context(rendezvous.publish(name, port, bitrate=bitrate))
         server = BusServer(can, served)
         loop = asyncio.get_running_loop()
-        listener = await loop.create_server(server.accept, sock=listening)
+        listener = await loop.create_server(server.accept, sock=listening, backlog=_BACKLOG)
         try:
             yield server
         finally:
