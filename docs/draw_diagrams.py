@@ -1,9 +1,9 @@
-"""Draws `assets/diagrams/`: a message's way through the files, the tree that gateways agree on, and a robot's balance.
+"""Draws `assets/diagrams/`: a message's way through the files, the tree of gateways, and drives of two robots.
 
 Run it from the root of the project when a walk in `architecture.md`, the gateways' protocol or that robot changes:
 `python docs/draw_diagrams.py`. The way is drawn from the tables in `architecture.md`, which tests compare with the
-code. The tree is that of real gateways under virtual time, the balance that of the emulated tiltOne. A test compares
-pictures and code.
+code. The tree is that of real gateways under virtual time, the drives are those of emulated robots. A test
+compares pictures and code.
 """
 
 import asyncio
@@ -17,6 +17,7 @@ from xml.sax.saxutils import escape
 
 import r2p
 from r2p import sim
+from r2p.tools.sim.robocom import RobocomDisplay, RobocomFigures
 from r2p.tools.sim.tiltone import TiltOneDisplay, TiltOneFigures
 
 FOLDER = Path(__file__).parent / "assets" / "diagrams"
@@ -54,7 +55,7 @@ _STYLE = """
 
 def pictures() -> dict[str, str]:
     """Return all pictures by their file names."""
-    return {"message.svg": message(), "gateways.svg": gateways(), "tiltone.svg": balance()}
+    return {"message.svg": message(), "gateways.svg": gateways(), "tiltone.svg": balance(), "robocom.svg": eight()}
 
 
 def _svg(width: float, height: float, title: str, parts: Iterator[str]) -> str:
@@ -311,6 +312,55 @@ def _panel(curve: _Curve, top: float) -> Iterator[str]:
         step = _ACROSS / (len(values) - 1)
         points = " ".join(f"{_MARGIN + index * step:.1f},{y(value):.1f}" for index, value in enumerate(values))
         yield f'<polyline class="{style}" points="{points}"/>'
+
+
+# A robot's way
+
+_SCALE, _CENTRE = 82, (360, 300)  # px of a metre, and where the drive began
+_DRIVE, _LOOK = 34.0, 0.2  # s: one figure of eight, and between two points
+
+
+def eight() -> str:
+    """Return where Robocom was on a figure of eight, and where its odometry and its GPS say that it was."""
+    figures = sim.run(_drive_eight, seed=1)
+    title = "Robocom on a figure of eight: the true way, the one of its odometry, and the fixes of its GPS"
+    return _svg(720, 704, title, _drawn_way(figures))
+
+
+async def _drive_eight() -> list[RobocomFigures]:
+    """The demonstration of `r2p sim robocom`."""
+    via = "memory:eight"
+    display = RobocomDisplay(via, seed=2)
+    async with display.robot as robot, r2p.Module("PC1", via=via, watchdog=False) as pc:
+        await robot.ready()
+        display.watch(pc)
+        display.drive(pc, rounds=1)
+        figures = []
+        for _ in range(round(_DRIVE / _LOOK)):
+            figures.append(display.read())
+            await asyncio.sleep(_LOOK)
+        return figures
+
+
+def _drawn_way(figures: list[RobocomFigures]) -> Iterator[str]:
+    def on_paper(x: float, y: float) -> str:
+        """North is to the right, west is up."""
+        return f"{_CENTRE[0] + x * _SCALE:.1f},{_CENTRE[1] - y * _SCALE:.1f}"
+
+    for fix in figures[-1].fixes:
+        x, y = on_paper(*fix).split(",")
+        yield f'<circle class="head" cx="{x}" cy="{y}" r="3.5"/>'
+    told = [each.odometry.pose for each in figures if each.odometry is not None]
+    ways = {"wanted": [(each.x, each.y) for each in told], "curve": [each.pose[:2] for each in figures]}
+    for style, points in ways.items():
+        yield f'<polyline class="{style}" points="{" ".join(on_paper(*point) for point in points)}"/>'
+    for x, style, meaning in ((40, "curve", "true"), (140, "wanted", "odometry")):
+        yield f'<path class="{style}" d="M{x} 684 h30"/>'
+        yield _text("note", x + 38, 688, meaning)
+    yield '<circle class="head" cx="290" cy="684" r="3.5"/>'
+    yield _text("note", 302, 688, "GPS, once a second")
+    yield f'<path class="axis" d="M560 684 h{_SCALE}"/>'
+    yield _text("note", 560 + _SCALE + 8, 688, "1 m")
 
 
 if __name__ == "__main__":
