@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from r2p.codecs.can_bits import FRAME_MAX, INTERMISSION, frame_bits_max
 from r2p.errors import TransportError
 from r2p.tools.config import UsageError
 from r2p.tools.output import notify, program
@@ -14,6 +15,8 @@ SERVED = "rtcan:r2psim:"
 """How the URLs of buses begin that programs serve."""
 
 _BITRATE = 1_000_000
+_CYCLE = 10_000  # us: of URLs that say nothing of it
+_SLOTS_MIN = 2  # in a cycle
 
 
 async def serve(
@@ -58,8 +61,15 @@ def checked(name: str) -> str:
 
 def hints(name: str, bitrate: int = _BITRATE) -> list[str]:
     """Return what to type in other terminals to look at a bus that is served."""
-    url = SERVED + name + (f",bitrate={bitrate}" if bitrate != _BITRATE else "")
+    url = SERVED + name + ("" if bitrate == _BITRATE else _options(bitrate))
     found = [f"{program()} bus dump --via {url}", f"{program()} bus load --via {url}"]
     if importlib.util.find_spec("can"):
         found += [f"python -m can.logger -i r2psim -c {name}"]
     return [f"  {each}" for each in found]
+
+
+def _options(bitrate: int) -> str:
+    """Return the options of a URL for a bit rate: its slots have room for the longest frame."""
+    longest = -(-(frame_bits_max(FRAME_MAX) + INTERMISSION) * 1_000_000 // bitrate)  # us
+    fitting = _CYCLE // longest
+    return f",bitrate={bitrate}," + (f"slots={fitting}" if fitting >= _SLOTS_MIN else f"slots={_SLOTS_MIN},cycle=100ms")

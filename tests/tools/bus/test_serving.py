@@ -19,7 +19,9 @@ from r2p.sim.buses import rendezvous
 from r2p.sim.buses.attachment import AttachmentOptions
 from r2p.sim.buses.served import ServedAttachment, connect
 from r2p.tools.bus import app
+from r2p.tools.bus.serving import hints
 from r2p.tools.main import app as r2p
+from r2p.transports.url import open_transport
 from tests.tools.rig import process
 
 if TYPE_CHECKING:
@@ -174,3 +176,9 @@ def test_commands_of_a_bus_name_those_that_are_served() -> None:
         result = CliRunner().invoke(app, ["dump"])
     assert result.exit_code == 2
     assert "as in --via rtcan:can0; programs serve rtcan:r2psim:lab" in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize("bitrate", [1_000_000, 500_000, 125_000, 20_000, 10_000])
+def test_the_urls_that_it_prints_are_valid(bitrate: int) -> None:
+    for hint in hints("lab", bitrate)[:2]:
+        open_transport(hint.partition("--via ")[2])
