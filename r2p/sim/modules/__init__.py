@@ -30,7 +30,15 @@ from r2p.sim.modules.firmware import FirmwareModule, Publishes, Subscribes
 from r2p.sim.modules.flash import BOARD, FlashTimes, MemoryMap
 from r2p.sim.modules.loader import EmulatedLoader, LoaderFaults
 from r2p.sim.modules.power import Powered, Wire
-from r2p.sim.modules.sensors import ImuModule, InertialUnit, Motion, ProximityModule, RangeArray
+from r2p.sim.modules.sensors import (
+    ImuModule,
+    InertialUnit,
+    Motion,
+    ProximityModule,
+    RangeArray,
+    SonarArray,
+    SonarModule,
+)
 
 __all__ = [
     "BOARD",
@@ -55,6 +63,8 @@ __all__ = [
     "ProximityModule",
     "Publishes",
     "RangeArray",
+    "SonarArray",
+    "SonarModule",
     "Subscribes",
     "Wire",
 ]

@@ -19,8 +19,10 @@ from r2p.sim.physics.inertial import (
     BAROMETER_NOISE,
     GRAVITY,
     GYROSCOPE,
+    IDENTITY,
     MAGNETOMETER,
     AccelerometerRange,
+    Calibration,
     ComplementaryFilter,
     GyroscopeRange,
     MagnetometerRange,
@@ -30,7 +32,8 @@ from r2p.sim.physics.inertial import (
     altitude_at,
     pressure_at,
 )
-from r2p.sim.physics.world import RangeCalibration, RangeFinder, RangeSpec
+from r2p.sim.physics.ultrasonic import Sonar, SonarSpec, captured, speed_of_sound
+from r2p.sim.physics.world import NOTHING, RangeCalibration, RangeFinder, RangeSpec
 
 DistanceTo = Callable[[int], float]
 """A function that returns the distance in mm to the object before sensor 0 to 3, or infinity."""
@@ -116,6 +119,72 @@ class ProximityModule(Board):
         """`period` in seconds: the sensors need 40 ms for a measurement."""
         node = functools.partial(proximity, sensors=sensors, topic=topic, period=period)
         super().__init__(name, via=via, remap=remap, parameters=parameters, nodes={"prox": node})
+
+
+class SonarArray:
+    """Four ultrasonic range finders, and the inputs of the timer that captures their pulses."""
+
+    def __init__(
+        self,
+        echo: Callable[[int, int], float],
+        noise: random.Random,
+        *,
+        temperature: Callable[[], float] = lambda: 20.0,
+        spec: SonarSpec | None = None,
+    ) -> None:
+        """`echo`: the distance (m) from which sensor `receiver` hears `source`; `temperature` of the air, Celsius."""
+        self.sensors = [Sonar(spec or SonarSpec(), noise) for _ in range(4)]
+        self.pulses = [captured(sensor.spec.silent) for sensor in self.sensors]
+        """The last pulse of each sensor, microseconds."""
+        self._echo = echo
+        self._temperature = temperature
+
+    def fire(self, numbers: Sequence[int]) -> None:
+        """Let these sensors measure at the same time: each takes the first echo that it hears for its own."""
+        for receiver in numbers:
+            nearest = min(self._echo(source, receiver) for source in numbers)
+            self.pulses[receiver] = captured(self.sensors[receiver].pulse(nearest, self._temperature()))
+
+    def read(self, temperature: float) -> Proximity:
+        """Return the last distances in mm, at the speed of sound at a temperature."""
+        half = speed_of_sound(temperature) / 2 / 1000  # mm per microsecond
+        one, two, three, four = (
+            NOTHING if pulse >= captured(sensor.spec.silent) else round(pulse * half)
+            for sensor, pulse in zip(self.sensors, self.pulses, strict=True)
+        )
+        return Proximity(ranges=(one, two, three, four))
+
+
+async def sonar(node: r2p.Node, sensors: SonarArray, topic: str) -> None:
+    """Fire the sensors in turn, or all at once, and publish the distances after each measurement."""
+    each = quantity(node, "period", 0.05, (0.05, 1.0), "s", "Period of the measurements: an echo needs up to 37.5 ms")
+    doc = "Of the air, for the speed of sound: 6 degrees are 1 % of the distance"
+    temperature = quantity(node, "temperature", 20.0, (-40.0, 85.0), "degC", doc)
+    doc = "Fire all sensors at once: four times as often, but each hears the others"
+    together = node.parameter("together", False, doc=doc)
+    ranges = node.advertise(topic, Proximity, r2p.Sporadic(deadline=_REACTION))
+    number = 0
+    async for _ in paced(node, each):
+        sensors.fire(range(4) if together.value else (number,))
+        number = (number + 1) % 4
+        await ranges.publish(sensors.read(temperature.value))
+
+
+class SonarModule(Board):
+    """The proximity module (thesis 7.5) with four ultrasonic range finders, on `sonar` in millimetres."""
+
+    def __init__(
+        self,
+        name: str = "PROX3",
+        *,
+        sensors: SonarArray,
+        topic: str = "sonar",
+        via: Via = None,
+        remap: dict[str, str] | None = None,
+        parameters: ParameterOptions | None = None,
+    ) -> None:
+        node = functools.partial(sonar, sensors=sensors, topic=topic)
+        super().__init__(name, via=via, remap=remap, parameters=parameters, nodes={"sonar": node})
 
 
 class Motion(msgspec.Struct, frozen=True):
@@ -217,7 +286,24 @@ async def sensors(node: r2p.Node, unit: InertialUnit) -> None:
     bias_gain = quantity(node, "filter_bias_gain", usual_bias, (0.0, 100.0), "1/s^2", doc, refilter)
     rescale(None)
     refilter(gain.value)
+    calibrated(node, unit.accelerometer, "acc", "mg")
+    calibrated(node, unit.gyroscope, "gyro", "mdps")
+    calibrated(node, unit.magnetometer, "mag", "mgauss")
     await asyncio.Event().wait()
+
+
+def calibrated(node: r2p.Node, sensor: MemsSensor, name: str, unit: str) -> None:
+    """Let the parameters of a node correct the readings of a sensor."""
+
+    def change(_value: object) -> None:
+        sensor.calibration = Calibration(offset=offset.value, scale=scale.value)
+
+    most = sensor.spec.full_scale
+    doc = "What each axis reads at 0, which is subtracted"
+    offset = node.parameter(f"{name}_offset", (0.0,) * 3, min=-most, max=most, unit=unit, doc=doc, on_change=change)
+    doc = "Matrix, row by row, that the difference is multiplied by: scale and direction of the axes"
+    scale = node.parameter(f"{name}_scale", IDENTITY, min=-2.0, max=2.0, doc=doc, on_change=change)
+    change(None)
 
 
 class ImuModule(Board):

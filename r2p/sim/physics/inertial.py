@@ -13,10 +13,13 @@ import msgspec
 
 Vector = tuple[float, float, float]
 Counts = tuple[int, int, int]
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 GRAVITY = 9.80665
 """m/s^2."""
+IDENTITY: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+"""A matrix, row by row, that changes nothing."""
 
 
 class MemsSpec(msgspec.Struct, frozen=True, kw_only=True):
@@ -31,6 +34,10 @@ class MemsSpec(msgspec.Struct, frozen=True, kw_only=True):
     """Noise density, per root of Hz."""
     bias: float
     """One sigma from device to device."""
+    scale: float = 0.0
+    """Error of the scale of each axis, one sigma from device to device; 0.01 is 1 %."""
+    misalignment: float = 0.0
+    """Angle between where each axis should point and where it points, one sigma, rad: soldering, and the chip."""
 
     @property
     def sigma(self) -> float:
@@ -63,6 +70,21 @@ BAROMETER_NOISE = 2.0
 """LPS331AP, one sigma, Pa."""
 
 
+class Calibration(msgspec.Struct, frozen=True, kw_only=True):
+    """How firmware corrects three axes: `scale`, a matrix row by row, times (the reading - `offset`)."""
+
+    offset: Vector = (0.0, 0.0, 0.0)
+    """In the unit of the data sheet."""
+    scale: Matrix = IDENTITY
+
+    def correct(self, values: Vector) -> Vector:
+        """Return corrected values."""
+        if self.scale is IDENTITY and not any(self.offset):
+            return values
+        x, y, z = values[0] - self.offset[0], values[1] - self.offset[1], values[2] - self.offset[2]
+        return _times(self.scale, (x, y, z))
+
+
 class MemsSensor:
     """One device: it samples at its rate, and holds the last sample in between."""
 
@@ -76,7 +98,12 @@ class MemsSensor:
         """The number of samples so far."""
         self._resolution = spec.resolution  # of the last sample
         self._noise = noise
-        self._bias = [noise.gauss(0, spec.bias) for _ in range(3)]
+        self.calibration = Calibration()
+        """How `values` are corrected; the counts are not."""
+        self.bias = [noise.gauss(0, spec.bias) for _ in range(3)]
+        """The reading at 0 that this device really has, in the unit of the data sheet."""
+        self.distortion = _distortion(spec, noise)
+        """What this device multiplies the truth by; None: nothing."""
         self._elapsed = 0.0
 
     def set_range(self, full_scale: float, resolution: float) -> None:
@@ -90,21 +117,38 @@ class MemsSensor:
             return False
         self._elapsed -= 1.0
         self._resolution = self.spec.resolution
-        x, y, z = (self._sample(value, bias) for value, bias in zip(truth, self._bias, strict=True))
+        if self.distortion is not None:
+            truth = _times(self.distortion, truth)
+        x, y, z = (self._sample(value, bias) for value, bias in zip(truth, self.bias, strict=True))
         self.counts = (x, y, z)
         self.samples += 1
         return True
 
     @property
     def values(self) -> Vector:
-        """The last sample, in the unit of the data sheet."""
+        """The last sample, corrected, in the unit of the data sheet."""
         x, y, z = self.counts
-        return x * self._resolution, y * self._resolution, z * self._resolution
+        return self.calibration.correct((x * self._resolution, y * self._resolution, z * self._resolution))
 
     def _sample(self, value: float, bias: float) -> int:
         spec = self.spec
         reading = value + bias + self._noise.gauss(0, spec.sigma)
         return round(max(-spec.full_scale, min(spec.full_scale, reading)) / spec.resolution)
+
+
+def _distortion(spec: MemsSpec, noise: random.Random) -> Matrix | None:
+    """Return the errors of a device's scale and axes; without any, no random number is drawn."""
+    if not spec.scale and not spec.misalignment:
+        return None
+    a, b, c, d, e, f, g, h, i = (
+        noise.gauss(1.0, spec.scale) if index % 4 == 0 else noise.gauss(0.0, spec.misalignment) for index in range(9)
+    )
+    return a, b, c, d, e, f, g, h, i
+
+
+def _times(m: Matrix, v: Vector) -> Vector:
+    x, y, z = v
+    return m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z, m[6] * x + m[7] * y + m[8] * z
 
 
 def pressure_at(altitude: float) -> float:

@@ -39,6 +39,8 @@ class World:
 
     def __init__(self, walls: Iterable[Wall] = ()) -> None:
         self.walls = list(walls)
+        self.temperature = 20.0
+        """Of the air, degrees Celsius."""
 
     def add_box(self, x: float, y: float, width: float, depth: float) -> None:
         """Add a box by its centre, and its sides `width` (along x) and `depth` (along y), m."""
@@ -172,6 +174,8 @@ class OmniBody:
         """Pose without errors: m, m, rad (not wrapped)."""
         self.velocity: Triple = (0.0, 0.0, 0.0)
         """Velocity without errors, in the robot's frame."""
+        self.acceleration: Triple = (0.0, 0.0, 0.0)
+        """Of the centre, as its inertia feels it, in the robot's frame: m/s^2, m/s^2, rad/s^2."""
         self.path = 0.0
         """Length of the path so far, m."""
         self._wear = [noise.gauss(1.0, spec.wear / 100) for _ in range(3)]
@@ -194,7 +198,14 @@ class OmniBody:
         self._move(self.spec.body_velocity(*rolled), dt)
 
     def _move(self, velocity: Triple, dt: float) -> None:
-        x, y, w = self.velocity = velocity
+        x, y, w = velocity
+        before, self.velocity = self.velocity, velocity
+        turn = (before[2] + w) / 2  # the frame turns, too: on a circle, what points to its centre does not change
+        self.acceleration = (
+            (x - before[0]) / dt - turn * (before[1] + y) / 2,
+            (y - before[1]) / dt + turn * (before[0] + x) / 2,
+            (w - before[2]) / dt,
+        )
         heading = self.w + w * dt / 2
         cos, sin = math.cos(heading), math.sin(heading)
         self.x += (x * cos - y * sin) * dt

@@ -3,12 +3,15 @@
 import functools
 import importlib
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from r2p.sim.modules.boards import ParameterOptions
+from r2p.sim.robots.base import EmulatedRobot
 from r2p.tools.bus.serving import checked
+from r2p.tools.config import did_you_mean
 from r2p.tools.options import Params, ParamsFile, Quiet, Verbose, Via, time_option
 from r2p.tools.session import UsageError, check_urls, execute, run_virtually, settings
 from r2p.tools.sim.parameters import parameter_sources
@@ -28,6 +31,17 @@ _DISPLAYS: dict[_Name, str] = {
 """The display of each robot, in a module with its name."""
 _ROBOTS = "Of the thesis: triskar2, on omni wheels; robocom, for sensor fusion; tiltone, which balances."
 
+
+def _complete_extra(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Return the extra modules of the robot that begin so, without those that are on the line."""
+    given = ctx.params.get("extras") or ()
+    return [
+        name
+        for name in display_of(ctx.params["robot"]).robot_class.extras
+        if name not in given and name.startswith(incomplete)
+    ]
+
+
 _Speed = Annotated[
     float | None,
     typer.Option(metavar="N", min=0.1, max=100.0, help="N times as fast as real time; ROS nodes follow its /clock."),
@@ -35,6 +49,15 @@ _Speed = Annotated[
 _Drive = Annotated[bool, typer.Option("--drive", help="Let a PC drive it, to look at it; implied by --fast.")]
 _Fast = Annotated[
     bool, typer.Option("--fast", help="As fast as possible, in virtual time; other programs can't connect.")
+]
+_With = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--with",
+        metavar="MODULE",
+        autocompletion=_complete_extra,
+        help="Start this extra module, too (repeatable): IMU1, IO1 or PROX3 of triskar2.",
+    ),
 ]
 _Bus = Annotated[
     str | None, typer.Option("--bus", metavar="NAME", help="Let other programs join the robot's bus by this name.")
@@ -51,6 +74,7 @@ def command(
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of all random numbers.")] = 0,
     drive: _Drive = False,
+    extras: _With = None,
     bus: _Bus = None,
     bus_report: _BusReport = False,
     allow_control: Annotated[
@@ -77,12 +101,14 @@ def command(
         check_urls(via or [])
         chosen = settings()
         display = display_of(robot)
-        sources = parameter_sources(chosen, display.robot_class.names, params or (), param or ())
+        modules = started_modules(display.robot_class, extras or ())
+        sources = parameter_sources(chosen, modules, params or (), param or ())
         parameters = ParameterOptions(params=sources, params_file=params_file or chosen.params_file)
         await simulate(
             display,
             duration=duration or (_FAST if fast else None),
             seed=seed,
+            modules=modules,
             outside=() if fast else tuple(via or default_links()),
             rounds=math.inf if drive or fast else 0,
             fast=fast,
@@ -102,6 +128,16 @@ def command(
         endless=endless,
         run=virtually if fast or speed is not None else None,
     )
+
+
+def started_modules(robot: type[EmulatedRobot], extras: Iterable[str]) -> list[str]:
+    """Return the modules that start: all but the extras that are not named. Raises UsageError."""
+    chosen = set(extras)
+    for name in chosen:
+        if name not in robot.names:
+            hint = did_you_mean(name, robot.extras, "extra modules") if robot.extras else "it has no extra modules"
+            raise UsageError(f"--with {name}: {robot.title} has no module {name}; {hint}")
+    return [name for name in robot.names if name not in robot.extras or name in chosen]
 
 
 def _check_fast(speed: float | None, open_to_others: dict[str, object]) -> None:

@@ -41,6 +41,7 @@ async def simulate(
     *,
     duration: float | None = None,
     seed: int = 0,
+    modules: Iterable[str] | None = None,
     outside: Iterable[str] = (),
     rounds: float = 0,
     fast: bool = False,
@@ -51,16 +52,17 @@ async def simulate(
 ) -> None:
     """Run a robot and show its figures, for `duration` seconds or until cancelled.
 
-    `outside`: URLs that the gateway opens. `rounds`: how often a PC drives what there is to see. `fast`: under virtual
-    time. `bus`: under which name other programs can join the robot's bus. `bus_report`: print statistics of the bus at
-    the end. `allow_control`: the gateway accepts REBOOT, BOOTLOAD and changes.
-    `parameters`: what those of the modules are at first. Raises UsageError for one that no module has, or a value that
-    does not fit.
+    `modules`: those to start; default: all but the extras. `outside`: URLs that the gateway opens. `rounds`: how often
+    a PC drives what there is to see. `fast`: under virtual time. `bus`: under which name other programs can join the
+    robot's bus. `bus_report`: print statistics of the bus at the end. `allow_control`: the gateway accepts REBOOT,
+    BOOTLOAD and changes. `parameters`: what those of the modules are at first. Raises UsageError for one that no module
+    has, or a value that does not fit.
     """
     name = kind.robot_class.title.lower()
     bridge = BridgeOptions(allow_control=allow_control)
     can = sim.can_bus(name, seed=seed)
-    display = kind(f"sim:{name}", seed=seed, outside=[*outside, _INSIDE], options=bridge, parameters=parameters)
+    links = [*outside, _INSIDE]
+    display = kind(f"sim:{name}", seed=seed, modules=modules, outside=links, options=bridge, parameters=parameters)
     robot = display.robot
     screen = SimulatorScreen(display, live=not fast, duration=duration)
     async with _served(can, bus), robot, r2p.Module("PC1", via=_INSIDE, watchdog=False) as pc:

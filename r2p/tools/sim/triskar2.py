@@ -38,6 +38,10 @@ class Triskar2Figures(msgspec.Struct, frozen=True):
     """V, A, and 0 to 1."""
     off_max: float = 0.0
     """The largest distance of an odometry from the true position so far, m."""
+    attitude: Triple | None = None
+    """Of the inertial sensors, if they are on: roll, pitch and yaw, rad."""
+    leds: str = ""
+    """Of the input/output module, if it is on."""
 
 
 class Triskar2Display(RobotDisplay[Triskar2Figures]):
@@ -69,6 +73,8 @@ class Triskar2Display(RobotDisplay[Triskar2Figures]):
             [wheel_figures(robot, name, drive) for name, drive in zip(MOTORS, hardware.drives, strict=True)],
             (battery.voltage, battery.current, battery.charge),
             self._odometry.off_max,
+            hardware.inertial.attitude.angles if "IMU1" in robot.modules else None,
+            "".join(".*"[on] for on in hardware.pins.digital) if "IO1" in robot.modules else "",
         )
 
     def state(self, body: Triskar2Figures) -> list[str]:
@@ -81,6 +87,8 @@ class Triskar2Display(RobotDisplay[Triskar2Figures]):
             WHEELS,
             *(wheel_line(wheel) for wheel in body.wheels),
             f"battery   {volts:.1f} V  {amperes:.1f} A  {charge:.0%}",
+            *([] if body.attitude is None else [_attitude_line(*body.attitude)]),
+            *([f"leds      {body.leds}"] if body.leds else []),
         ]
 
     def picture(self, body: Triskar2Figures) -> Text:
@@ -103,3 +111,11 @@ class Triskar2Display(RobotDisplay[Triskar2Figures]):
 
     def hints(self, url: str, *, driven: bool) -> list[str]:
         return [] if driven else [f"topic pub velocity_cmd x=0.2 -r 20 --via {url}"]
+
+
+def _attitude_line(roll: float, pitch: float, yaw: float) -> str:
+    """Return a line about what the inertial sensors say."""
+    angles = "  ".join(
+        f"{name} {math.degrees(angle):z4.0f}" for name, angle in (("roll", roll), ("pitch", pitch), ("yaw", yaw))
+    )
+    return f"imu       {angles} deg"
