@@ -59,6 +59,10 @@ _With = Annotated[
         help="Start this extra module, too (repeatable): IMU1, IO1 or PROX3 of triskar2.",
     ),
 ]
+_Param = Annotated[
+    list[str] | None,
+    typer.Option(metavar="[MODULE/]NODE.NAME=VALUE", help="Start with this value of a parameter (repeatable)."),
+]
 _Bus = Annotated[
     str | None, typer.Option("--bus", metavar="NAME", help="Let other programs join the robot's bus by this name.")
 ]
@@ -82,10 +86,7 @@ def command(
     ] = False,
     params_file: ParamsFile = None,
     params: Params = None,
-    param: Annotated[
-        list[str] | None,
-        typer.Option(metavar="[MODULE/]NODE.NAME=VALUE", help="Start with this value of a parameter (repeatable)."),
-    ] = None,
+    param: _Param = None,
     via: Via = None,
     verbose: Verbose = 0,
     quiet: Quiet = 0,
