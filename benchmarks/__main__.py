@@ -24,6 +24,7 @@ ALL = (
     "monitoring",
     "top",
     "rtcan",
+    "simulated_can",
     "timers",
     "playing",
     "dash",

@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 _ANSWER_S: Final = 5.0  # for the loop that runs the bus, if that is a loop of the program
 _STALLED_S: Final = 1.0  # without a frame that leaves a full queue, until a sender that would wait forever gives up
-_LOW_WATER: Final = TX_QUEUE // 2  # frames in the queue when senders that wait go on: one wake-up for many frames
+_LOW_WATER: Final = TX_QUEUE - 16  # frames in the queue when senders that wait go on: one wake-up for many frames
 _SELECT_MAX: Final = 1024  # descriptors that select() has
 _FORKED: Final = "this process was forked from the one that opened the bus: open buses after the fork"
 _clock: Final = SystemClock()
