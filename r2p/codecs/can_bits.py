@@ -211,6 +211,7 @@ def bits_until_lost(winner: int, loser: int) -> int:
     return before + _stuffed(winner >> after, before) + 1
 
 
+@lru_cache(maxsize=64)  # a frame that fails is sent again and again
 def wire_bits(frame: AnyFrame) -> str:
     """Return the bits of a frame as sent, `0` dominant, with stuff bits. Slow: for error frames."""
     bits, count = _up_to_crc(frame)

@@ -88,6 +88,11 @@ class SimCan:
         """Bit/s."""
         return SECOND // self.bus.bit
 
+    @property
+    def names(self) -> list[str]:
+        """The names of the nodes that are on the bus."""
+        return list(self._nodes)
+
     def utc(self, instant: int) -> int:
         """Return an instant of the bus (ns) as ns since 1970."""
         clock = self.bus.timeline.clock
@@ -129,6 +134,11 @@ class SimCan:
             return self.bus.attach(node)
         controller.power_on()
         return controller
+
+    def remove(self, controller: CanController) -> None:
+        """Disconnect a node for good: the next one of its name gets a controller of its own."""
+        self.bus.detach(controller)
+        del self._nodes[controller.name]
 
     def unplug(self, controller: CanController) -> None:
         """Disconnect the node of this controller, which has closed."""

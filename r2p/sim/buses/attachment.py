@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from r2p.codecs.can_bits import Frame, OtherFrame
+from r2p.codecs.can_bits import AnyFrame
 from r2p.errors import MessageError
 from r2p.sim.can import ControllerState, ErrorKind
 
@@ -31,7 +31,7 @@ class BusFilter(msgspec.Struct, frozen=True):
     mask: int
     extended: bool | None = None
 
-    def passes(self, frame: Frame | OtherFrame) -> bool:
+    def passes(self, frame: AnyFrame) -> bool:
         """Return whether a frame passes."""
         return not (frame.id ^ self.value) & self.mask and self.extended in (None, frame.extended)
 
@@ -93,7 +93,7 @@ class BusFrame(msgspec.Struct, frozen=True, gc=False):
     there is an error or a state.
     """
 
-    frame: Frame | OtherFrame | None
+    frame: AnyFrame | None
     end: int
     utc: int
     own: bool = False
@@ -116,7 +116,7 @@ class BusAttachment(ABC):
     """Bit/s."""
 
     @abstractmethod
-    def send(self, frame: Frame | OtherFrame, timeout: float | None = None) -> None:
+    def send(self, frame: AnyFrame, timeout: float | None = None) -> None:
         """Put a frame into the queue of `TX_QUEUE` frames, which leave it in this order; wait for room.
 
         `timeout` in seconds, 0 does not wait; None waits as long as frames leave the queue at all. Raises TimeoutError
@@ -168,7 +168,7 @@ class BusAttachment(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Leave the bus: the controller loses its power, frames that wait are dropped. Calls that wait raise `Closed`.
+        """Leave the bus; may be called again. Calls that wait raise `Closed`.
 
-        May be called again.
+        Frames that wait are still sent, if that takes no longer than a second, and if somebody else is on the bus.
         """

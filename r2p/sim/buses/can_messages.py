@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import can
 
-from r2p.codecs.can_bits import Frame, OtherFrame
+from r2p.codecs.can_bits import AnyFrame, Frame, OtherFrame
 from r2p.errors import MessageError
 from r2p.sim.buses.attachment import BusFilter, BusFrame
 from r2p.sim.can import ControllerState, ErrorKind
@@ -27,14 +27,15 @@ ERROR_ACTIVE: Final = 0x40
 
 # ... data[2] the error, and data[3] where it was.
 BIT_ERROR: Final = 0x01
+FORM_ERROR: Final = 0x02
 STUFF_ERROR: Final = 0x04
 TX_ERROR: Final = 0x80  # in a frame of this node
 
-_TYPES: Final = {ErrorKind.BIT: BIT_ERROR, ErrorKind.STUFF: STUFF_ERROR}
+_TYPES: Final = {ErrorKind.BIT: BIT_ERROR, ErrorKind.STUFF: STUFF_ERROR, ErrorKind.FORM: FORM_ERROR}
 _PASSIVE_ABOVE: Final = 127
 
 
-def frame_of(message: can.Message) -> Frame | OtherFrame:
+def frame_of(message: can.Message) -> AnyFrame:
     """Return the frame that a message asks for. Raises `MessageError` for one that CAN 2.0 does not have."""
     if message.is_fd:
         raise MessageError("simulated buses are CAN 2.0, without CAN FD: send messages without is_fd")
@@ -51,14 +52,13 @@ def message_of(event: BusFrame, channel: str) -> can.Message | None:
     frame = event.frame
     if frame is None:
         return _error_of(event, channel)
-    extended, remote = (True, None) if isinstance(frame, Frame) else (frame.extended, frame.remote)
     return can.Message(
         event.utc / SECOND,
         frame.id,
-        extended,
-        remote is not None,
+        frame.extended,
+        frame.remote is not None,
         channel=channel,
-        dlc=len(frame.data) if remote is None else remote,
+        dlc=len(frame.data) if frame.remote is None else frame.remote,
         data=frame.data,
         is_rx=not event.own,
     )

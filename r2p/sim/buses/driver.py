@@ -6,11 +6,15 @@ All methods run in the bus's loop. `local` uses it for programs of this process,
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from r2p.codecs.can_bits import Frame, OtherFrame
+from r2p.codecs.can_bits import AnyFrame
 from r2p.sim.buses.attachment import AttachmentOptions, BusFilter, BusFrame
-from r2p.sim.can import CanController, CanNode, ControllerState, ErrorKind, FrameRecord
+from r2p.sim.can import BusError, CanController, CanNode, ControllerState, ErrorKind
 from r2p.sim.can.controller import ignore
 from r2p.sim.transport import PluggedNode, SimCan
+from r2p.units import SECOND
+
+LINGER = SECOND
+"""Ns for which a node stays on the bus to send its queue, after its program has left."""
 
 
 class BusDriver(PluggedNode):
@@ -28,35 +32,30 @@ class BusDriver(PluggedNode):
         on_room: Callable[[], object] = ignore,
     ) -> None:
         self.shared = shared
-        self.queue: deque[Frame | OtherFrame] = deque()
+        self.queue: deque[AnyFrame] = deque()
         """Frames to be sent; the first one stays here until it has been sent. Other threads may append."""
-        self.last_error: ErrorKind | None = None
-        """Why the latest attempt to send failed; None after one that did not."""
         self._deliver = deliver
         self._on_room = on_room
         self._own = options.own
+        self._states = options.states
         self._filters: tuple[BusFilter, ...] = options.filters
         self.sending = False
         """Whether the controller holds the first frame of the queue. If so, `pump` is not needed for those after it."""
-        self._states, self._errors = options.states, options.errors
-        name = shared.free_name(options.name)
-        self.controller = shared.plug_in(self, node_of(options, name))
-        self._listen_only = options.listen_only
-        self._set_callbacks(self.controller)
-        if self._listen_only or not shared.powered:
+        self._leaving = self._closed = False
+        self.controller = shared.plug_in(self, node_of(options, shared.free_name(options.name)))
+        self._set_callbacks(self.controller, options)
+        if not shared.powered:
             self.controller.power_off()
-        shared.bus.observers.append(self._observe)
 
     @property
     def state(self) -> ControllerState:
-        """The state of the controller; one that only listens is error active."""
-        return ControllerState.ACTIVE if self._listen_only else self.controller.state
+        """The state of the controller."""
+        return self.controller.state
 
     @property
     def error_counters(self) -> tuple[int, int]:
         """The transmit and receive error counters."""
-        confinement = self.controller.confinement
-        return confinement.transmit, confinement.receive
+        return self.controller.transmit_errors, self.controller.receive_errors
 
     def pump(self) -> None:
         """Send what has been put into the queue."""
@@ -90,44 +89,55 @@ class BusDriver(PluggedNode):
         self._change(ControllerState.DOWN, self.controller.clock.monotonic())
 
     def power_on(self) -> None:
-        if not self._listen_only:
-            self.controller.power_on()
+        self.controller.power_on()
+
+    def leave(self) -> None:
+        """Leave the bus when the queue is empty, or after a second; nothing is delivered any more."""
+        timeline = self.shared.bus.timeline
+        timeline.catch_up()
+        self._deliver = self._on_room = ignore
+        if self.queue and self.controller.live:
+            self._leaving = True
+            timeline.at(timeline.now() + LINGER, self.close)
+        else:
+            self.close()
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the bus now, as if the power was cut."""
+        if self._closed:
+            return
+        self._closed = True
         self.shared.bus.timeline.catch_up()
-        self.shared.bus.observers.remove(self._observe)
-        _clear_callbacks(self.controller)
-        self.shared.unplug(self.controller)
+        self.shared.remove(self.controller)
         self.queue.clear()
 
     # From the controller
 
-    def _set_callbacks(self, controller: CanController) -> None:
+    def _set_callbacks(self, controller: CanController, options: AttachmentOptions) -> None:
         controller.on_receive = controller.on_other = self._received
         controller.on_sent = self._sent
         controller.on_error = self._given_up
         controller.on_lost = self._lost
         controller.on_state = self._change
+        if options.errors:
+            controller.on_bus_error = self._seen
 
-    def _received(self, frame: Frame | OtherFrame, stamp: int) -> None:
+    def _received(self, frame: AnyFrame, stamp: int) -> None:
         if not self._filters or any(each.passes(frame) for each in self._filters):
             self._deliver(BusFrame(frame, stamp, self.shared.utc(stamp)))
 
-    def _sent(self, frame: Frame | OtherFrame, stamp: int) -> None:
-        self.last_error = None
+    def _sent(self, frame: AnyFrame, stamp: int) -> None:
         self._leave()
         if self._own and (not self._filters or any(each.passes(frame) for each in self._filters)):
             self._deliver(BusFrame(frame, stamp, self.shared.utc(stamp), own=True))
 
-    def _given_up(self, _frame: Frame | OtherFrame, kind: ErrorKind, _stamp: int) -> None:
-        self.last_error = kind
+    def _given_up(self, _frame: AnyFrame, kind: ErrorKind, _stamp: int) -> None:
         if kind is ErrorKind.BUS_OFF:
             self.sending = False  # the frame stays in the queue
         else:
             self._leave()
 
-    def _lost(self, _frame: Frame | OtherFrame, _stamp: int) -> None:
+    def _lost(self, _frame: AnyFrame, _stamp: int) -> None:
         self._leave()
 
     def _leave(self) -> None:
@@ -137,6 +147,8 @@ class BusDriver(PluggedNode):
         self.sending = False
         self._next()
         self._on_room()
+        if self._leaving and not self.queue:
+            self.close()
 
     def _next(self) -> None:
         if self.queue and not self.sending:
@@ -148,22 +160,10 @@ class BusDriver(PluggedNode):
             self._deliver(BusFrame(None, stamp, self.shared.utc(stamp), state=state, tx_errors=tx, rx_errors=rx))
         self._next()
 
-    # From the bus
-
-    def _observe(self, record: FrameRecord) -> None:
-        if record.error is None:
-            if self._listen_only:
-                self._received(record.frame, self.controller.clock.local(record.end))
-        elif self._listen_only or self.controller.state is not ControllerState.DOWN:
-            self._attempt_failed(record, record.error)
-
-    def _attempt_failed(self, record: FrameRecord, error: ErrorKind) -> None:
-        own = self.controller.name in record.senders
-        if own:
-            self.last_error = error
-        if self._errors:
-            stamp, (tx, rx) = self.controller.clock.local(record.end), self.error_counters
-            self._deliver(BusFrame(None, stamp, self.shared.utc(stamp), own, error, tx_errors=tx, rx_errors=rx))
+    def _seen(self, error: BusError, stamp: int) -> None:
+        tx, rx = self.error_counters
+        utc = self.shared.utc(stamp)
+        self._deliver(BusFrame(None, stamp, utc, error.sending, error.kind, error.field, tx_errors=tx, rx_errors=rx))
 
 
 def node_of(options: AttachmentOptions, name: str) -> CanNode:
@@ -176,9 +176,5 @@ def node_of(options: AttachmentOptions, name: str) -> CanNode:
         drift_ppm=options.drift_ppm,
         loss=options.loss,
         recovery=options.recovery,
+        listen_only=options.listen_only,
     )
-
-
-def _clear_callbacks(controller: CanController) -> None:
-    controller.on_receive = controller.on_other = controller.on_sent = controller.on_lost = ignore
-    controller.on_error = controller.on_state = ignore

@@ -20,6 +20,7 @@ import weakref
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from r2p.clock import SystemClock
+from r2p.codecs.can_bits import FRAME_MAX, IDENTIFIER_BITS, Frame, check_frame
 from r2p.errors import Closed, Error, TransportError
 from r2p.log_lines import get_logger
 from r2p.sim.buses.attachment import BITRATE, TX_QUEUE, AttachmentOptions, BusAttachment, BusFilter, BusFrame
@@ -32,7 +33,7 @@ from r2p.units import SECOND
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from r2p.codecs.can_bits import Frame, OtherFrame
+    from r2p.codecs.can_bits import AnyFrame
 
 logger = get_logger("r2p.buses")
 
@@ -84,10 +85,12 @@ class LocalAttachment(BusAttachment):
 
     # In any thread
 
-    def send(self, frame: Frame | OtherFrame, timeout: float | None = None) -> None:
+    def send(self, frame: AnyFrame, timeout: float | None = None) -> None:
         self._check()
         if self._listen_only:
             raise TransportError(f"{self.description}: this node only listens: open the bus without listen_only")
+        if frame.__class__ is not Frame or frame.id >> IDENTIFIER_BITS or len(frame.data) > FRAME_MAX:
+            check_frame(frame)
         driver = self._driver
         if driver.state is ControllerState.BUS_OFF:
             raise TransportError(f"{self.description}: bus off, after too many errors: restart the controller first")
@@ -214,8 +217,10 @@ class LocalAttachment(BusAttachment):
     def _why_full(self, driver: BusDriver) -> str:
         if driver.state is ControllerState.DOWN:
             return ": this node has no power"
-        if driver.last_error is not None:
-            return f": the first one fails again and again, {driver.last_error.value}"
+        if errors := driver.error_counters[0]:
+            return (
+                f": the first one fails again and again, {errors} transmit errors: is there a node that acknowledges?"
+            )
         if self._still or threading.get_ident() == self._thread:
             return ": await asyncio.sleep(...) between frames, as the bus needs time to send them"
         return ""
@@ -253,7 +258,7 @@ class LocalAttachment(BusAttachment):
         return BusDriver(shared, options, self._deliver, self._frame_left)
 
     def _stop(self) -> None:
-        self._driver.close()
+        self._driver.leave()
         if self._guard is not None:
             self._guard.cancel()
 

@@ -25,7 +25,7 @@ from can.broadcastmanager import (
 )
 
 from r2p.clock import in_background
-from r2p.errors import Error, TransportError
+from r2p.errors import Error, MessageError, TransportError
 from r2p.sim.buses import attach, channels
 from r2p.sim.buses.attachment import RX_QUEUE, AttachmentOptions, BusAttachment
 from r2p.sim.buses.can_messages import filters_of, frame_of, message_of
@@ -168,11 +168,13 @@ class R2pSimBus(can.BusABC):
         """Put a message into the queue of 128 frames, which are sent in this order; wait for room, `timeout` seconds.
 
         Without a timeout it waits as long as frames leave the queue at all. Raises CanTimeoutError when the queue stays
-        full, and CanOperationError in bus-off.
+        full, CanOperationError in bus-off, and ValueError for a message that CAN 2.0 does not have.
         """
         frame = frame_of(msg)
         try:
             self._attachment.send(frame, timeout)
+        except MessageError:
+            raise
         except Error as error:
             raise can.CanOperationError(str(error)) from error
         except TimeoutError as error:
@@ -216,7 +218,7 @@ class R2pSimBus(can.BusABC):
             return self._attachment.fileno()
 
     def shutdown(self) -> None:
-        """Leave the bus, and drop the messages that wait. `recv` in other threads raises CanOperationError."""
+        """Leave the bus; messages that wait are still sent. `recv` in other threads raises CanOperationError."""
         super().shutdown()
         self._attachment.close()
 

@@ -41,7 +41,15 @@ def pair(channel: str) -> Iterator[tuple[can.BusABC, can.BusABC]]:
         yield a, b
 
 
-KINDS = [message(0x1FFFFFFF, bytes(range(8))), message(0x7FF), message(0, b"1")]
+KINDS = [
+    message(0x1FFFFFFF, bytes(range(8))),
+    message(0x7FF),
+    message(0x7FF, bytes(range(8)), is_extended_id=False),
+    message(0, is_extended_id=False),
+    message(0x7FF, is_extended_id=False, is_remote_frame=True, dlc=0),
+    message(0x7FF, is_extended_id=False, is_remote_frame=True, dlc=8),
+    message(0x1FFFFFFF, is_remote_frame=True, dlc=3),
+]
 
 
 @pytest.mark.parametrize("sent", KINDS, ids=str)
@@ -106,7 +114,10 @@ def test_a_queue_that_no_frame_leaves_is_an_error(channel: str) -> None:
     with can.Bus(interface="r2psim", channel=channel, served=False) as alone:
         for identifier in range(128):
             alone.send(message(identifier))
-        with pytest.raises(can.exceptions.CanTimeoutError, match="is full: the first one fails again and again"):
+        passive = alone.recv(SOON)
+        assert passive is not None
+        assert passive.is_error_frame
+        with pytest.raises(can.exceptions.CanTimeoutError, match="is full: the first one fails, "):
             alone.send(message(1), 0.001)
         with pytest.raises(can.exceptions.CanTimeoutError, match="the queue of 128 frames is full"):
             alone.send(message(1), 0)
@@ -131,6 +142,14 @@ def test_shutdown_ends_calls_that_wait(channel: str, timeout: float | None) -> N
         with pytest.raises(can.CanOperationError, match="closed"):
             call()
     bus.shutdown()
+
+
+def test_what_is_sent_before_shutdown_arrives(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    a, b = pair
+    for identifier in range(100):
+        a.send(message(identifier))
+    a.shutdown()
+    assert [getattr(b.recv(SOON), "arbitration_id", None) for _ in range(100)] == list(range(100))
 
 
 def test_closing_leaves_nothing_behind(channel: str) -> None:
@@ -235,6 +254,9 @@ def test_what_can_does_not_have_is_refused(pair: tuple[can.BusABC, can.BusABC]) 
     for wrong, words in (
         (message(1, is_fd=True), "without CAN FD"),
         (message(1, is_error_frame=True), "error frames come from errors"),
+        (message(0x800, is_extended_id=False), "the identifier 0x800 has more than 11 bits"),
+        (message(0x20000000), "the identifier 0x20000000 has more than 29 bits"),
+        (message(1, bytes(9)), "9 bytes"),
     ):
         with pytest.raises(ValueError, match=words):
             pair[0].send(wrong)

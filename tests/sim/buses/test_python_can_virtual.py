@@ -1,6 +1,7 @@
 """python-can's interface `r2psim` under virtual time: instants, arbitration, errors, asyncio."""
 
 import asyncio
+import contextlib
 import itertools
 from collections.abc import Iterator
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 import r2p
 import r2p.sim
 from r2p.clock import clock_of
-from r2p.codecs.can_bits import INTERMISSION, frame_bits
+from r2p.codecs.can_bits import INTERMISSION, FrameField, frame_bits
 from r2p.msg import Led
 from r2p.testing.network import node_in
 from r2p.units import SECOND
@@ -62,6 +63,22 @@ async def test_the_lowest_identifier_wins() -> None:
         await asyncio.sleep(0.001)
         assert identifiers(c) == [0x200, 0x300]
         assert identifiers(a) == [0x200]
+
+
+async def test_frames_of_all_kinds_are_arbitrated() -> None:
+    kinds = [
+        can.Message(arbitration_id=0x10, is_extended_id=False),
+        can.Message(arbitration_id=0x10, is_extended_id=False, is_remote_frame=True, dlc=4),
+        can.Message(arbitration_id=0x10 << 18, data=b"x"),
+        can.Message(arbitration_id=0x10 << 18, is_remote_frame=True, dlc=4),
+    ]
+    with bus() as spy, contextlib.ExitStack() as stack:
+        for sent in reversed(kinds):
+            stack.enter_context(bus()).send(sent)
+        await asyncio.sleep(0.001)
+        found = list(received(spy))
+    for one, other in zip(found, kinds, strict=True):
+        assert one.equals(other, timestamp_delta=None, check_channel=False, check_direction=False)
 
 
 async def test_messages_of_one_node_keep_their_order() -> None:
@@ -245,9 +262,8 @@ async def test_each_error_frame_is_a_message_for_those_who_ask() -> None:
         sender, (receiver, frame) = list(received(a)), received(b)
         assert [each.is_error_frame for each in sender] == [True]
         assert sender[0].arbitration_id == receiver.arbitration_id == 0x288
-        assert (sender[0].data[2], sender[0].data[6]) == (0x81, 8)
-        assert receiver.is_error_frame
-        assert not receiver.data[2] & 0x80
+        assert (sender[0].data[2], sender[0].data[3], sender[0].data[6]) == (0x81, FrameField.ID_17_TO_13, 8)
+        assert (receiver.is_error_frame, receiver.data[2], receiver.data[7]) == (True, 0x04, 1)
         assert frame.arbitration_id == 0x555  # it was sent again
 
 
@@ -321,6 +337,26 @@ async def test_the_clock_of_a_node_may_be_wrong() -> None:
     assert wrong is not None
     assert right is not None
     assert wrong.timestamp - right.timestamp == pytest.approx(2.501, abs=1e-6)
+
+
+async def test_a_bus_that_closes_sends_its_queue() -> None:
+    with bus() as b:
+        with bus() as a:
+            for identifier in range(5):
+                a.send(message(identifier))
+        await asyncio.sleep(0.001)
+        assert identifiers(b) == [0, 1, 2, 3, 4]
+        assert list(r2p.sim.can_bus("lab").names) == ["python-can"]
+
+
+async def test_a_bus_that_closes_gives_up_after_a_second() -> None:
+    with bus(listen_only=True):
+        with bus(name="alone") as a:
+            a.send(message(1))
+        await asyncio.sleep(0.9)
+        assert "alone" in r2p.sim.can_bus("lab").names
+        await asyncio.sleep(0.2)
+        assert "alone" not in r2p.sim.can_bus("lab").names
 
 
 async def test_modules_and_python_can_are_on_one_bus() -> None:
