@@ -98,6 +98,7 @@ class BusDriver(PluggedNode):
         self._deliver = self._on_room = ignore
         if self.queue and self.controller.live:
             self._leaving = True
+            self._next()
             timeline.at(timeline.now() + LINGER, self.close)
         else:
             self.close()

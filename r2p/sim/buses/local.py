@@ -202,12 +202,15 @@ class LocalAttachment(BusAttachment):
         """Wait until the queue has room; called with the condition's lock. Raises TimeoutError."""
         waits = timeout != 0 and not self._still and threading.get_ident() != self._thread
         deadline = None if timeout is None else _clock.monotonic() + round(timeout * SECOND)
+        stalls = 0
         self._senders += 1
         try:
             while waits and len(driver.queue) >= TX_QUEUE:
                 left = self._left
-                rest = _STALLED_S if deadline is None else (deadline - _clock.monotonic()) / SECOND
-                waits = rest > 0 and (self._room.wait(rest) or (deadline is None and left != self._left))
+                rest = _STALLED_S / 2 if deadline is None else (deadline - _clock.monotonic()) / SECOND
+                woken = rest > 0 and self._room.wait(rest)
+                stalls = 0 if left != self._left else stalls + 1  # one is also what a process finds that was stopped
+                waits = woken or (deadline is None and stalls < 2)
                 self._check()
         finally:
             self._senders -= 1

@@ -27,7 +27,7 @@ from r2p.units import SECOND
 if TYPE_CHECKING:
     import can
 
-ECHO_ON_REQUEST = frozenset({"kvaser", "neovi", "nixnet", "pcan", "vector", "virtual"})
+ECHO_ON_REQUEST = frozenset({"kvaser", "neovi", "nixnet", "pcan", "r2psim", "vector", "virtual"})
 """Interfaces that return own frames, once they are on the bus, if asked to."""
 
 ECHO_ALWAYS = frozenset({"udp_multicast"})
