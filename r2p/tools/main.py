@@ -25,6 +25,7 @@ GROUPS = {
     "service": ("r2p.tools.service", "List, inspect and call services."),
     "node": ("r2p.tools.node", "List nodes; start, stop and swap them."),
     "param": ("r2p.tools.param", "List, get, set and save parameters of nodes."),
+    "imu": ("r2p.tools.imu", "Calibrate inertial sensors."),
     "module": ("r2p.tools.module", "List, stop and restart modules."),
     "app": ("r2p.tools.app", "List, load, remove and start the apps of a firmware module."),
     "msg": ("r2p.tools.msg", "Show message types, and exchange them with C and ROS."),
