@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import msgspec
 
 from r2p.sim.physics.motor import Motor
+from r2p.sim.physics.world import Triple
 
 Pair = tuple[float, float]
 
@@ -43,10 +44,10 @@ class DifferentialSpec(msgspec.Struct, frozen=True, kw_only=True):
         turn = self.track / 2 * w
         return (x - turn) / self.wheel_radius, (x + turn) / self.wheel_radius
 
-    def body_velocity(self, left: float, right: float) -> Pair:
-        """Return the velocity of the body (m/s, rad/s) for these speeds of the wheels (rad/s)."""
+    def body_velocity(self, left: float, right: float) -> Triple:
+        """Return the velocity of the body (m/s, m/s, rad/s) for these speeds of the wheels (rad/s)."""
         radius = self.wheel_radius
-        return radius * (left + right) / 2, radius * (right - left) / self.track
+        return radius * (left + right) / 2, 0.0, radius * (right - left) / self.track
 
 
 class DifferentialBody:
@@ -80,7 +81,7 @@ class DifferentialBody:
     def step(self, dt: float) -> None:
         """Advance by `dt` seconds."""
         left, right = self.motors
-        v, w = self.spec.body_velocity(left.speed, right.speed)
+        v, _, w = self.spec.body_velocity(left.speed, right.speed)
         one, other = left.torque(), right.torque()
         both = (one + other - self._coupling * w * w) / self.ahead
         against = (other - one + self._coupling * v * w * 2 / self.spec.track) / self.turning

@@ -38,6 +38,7 @@ from r2p.sim.physics.ultrasonic import Beam, SonarSpec, echo
 from r2p.sim.physics.world import OmniBody, Triple, World
 from r2p.sim.robots import triskar2
 from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotOptions
+from r2p.sim.robots.shared_nodes import BATTERY, TIMEOUT, Traffic, battery_monitor
 from r2p.transports.link import Transport
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ class Hardware:
         self.body = OmniBody(triskar2.BODY, self.motors, self.noise("body"))
         gains = _rounded(speed_gains(triskar2.MOTOR, self.body.own, frequency=FREQUENCY, damping=DAMPING))
         self.drives = [Drive(motor, gains) for motor in self.motors]
-        self.battery = LeadBattery(triskar2.BATTERY)
+        self.battery = LeadBattery(BATTERY)
         self.pins = Pins()
         """The connectors of the input/output module: LEDs at its digital outputs, a thermometer at input 0."""
         self.inertial = InertialUnit(
@@ -184,7 +185,7 @@ class Triskar2(EmulatedRobot):
         *,
         seed: object = 0,
         world: World | None = None,
-        traffic: triskar2.Traffic | None = None,
+        traffic: Traffic | None = None,
         **options: Unpack[RobotOptions],
     ) -> None:
         self.hardware = Hardware(seed, world)
@@ -195,7 +196,7 @@ class Triskar2(EmulatedRobot):
             "MOTOR3": BoardPlan(self._motor),
             "PROX1": BoardPlan(self._proximity, {"obstacle": functools.partial(triskar2.obstacle_avoidance, **chain)}),
             "PROX2": BoardPlan(self._proximity),
-            "PS": BoardPlan(self._power_supply, {"battery": triskar2.battery_monitor}),
+            "PS": BoardPlan(self._power_supply, {"battery": battery_monitor}),
             "GW": BoardPlan(self.make_gateway),
             "IMU1": BoardPlan(self._imu, {"cube": functools.partial(cube, hardware=self.hardware)}),
             "IO1": BoardPlan(self._inputs_outputs),
@@ -219,7 +220,7 @@ class Triskar2(EmulatedRobot):
             setpoint="speed",
             message=Speed3,
             ticks=lambda speeds: speeds.value[wheel] * ticks,
-            timeout=triskar2.TIMEOUT,
+            timeout=TIMEOUT,
             encoder=f"encoder{wheel + 1}",
             period=triskar2.PERIOD,
             current=f"current{wheel + 1}",

@@ -12,8 +12,8 @@ import r2p
 from r2p.msg import Float32, Tilt, Velocity3
 from r2p.sim.robots.base import RobotOptions
 from r2p.sim.robots.figures import OdometryCheck, OdometryFigures, WheelFigures
+from r2p.sim.robots.shared_nodes import COMMANDS, FRESH, Latest
 from r2p.sim.robots.tiltone.robot import MOTORS, TiltOne
-from r2p.sim.robots.triskar2 import COMMANDS, FRESH, Latest
 from r2p.tools.sim.display import (
     PICTURE_HEIGHT,
     PICTURE_WIDTH,

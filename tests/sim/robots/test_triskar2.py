@@ -16,6 +16,7 @@ from r2p.msg import Battery, Encoder, Odometry, Velocity3
 from r2p.sim.physics.world import World
 from r2p.sim.robots import triskar2
 from r2p.sim.robots.emulated import MOTORS, Hardware, Triskar2
+from r2p.sim.robots.shared_nodes import COMMANDS, FRESH, TIMEOUT, battery_monitor
 from r2p.sim.robots.triskar2 import square
 from r2p.testing.network import node_in
 from r2p.tools.run import load
@@ -44,7 +45,7 @@ NODES = {
 async def forward(node: r2p.Node, speed: float = 0.5) -> None:
     """Drive ahead, for ever."""
     commands = node.advertise("velocity_cmd", Velocity3, r2p.Sporadic(deadline=0.05))
-    async for _ in node.every(triskar2.COMMANDS):
+    async for _ in node.every(COMMANDS):
         await commands.publish(Velocity3(x=speed))
 
 
@@ -88,7 +89,7 @@ async def test_odometry_follows_a_turning_robot_and_tells_its_velocity_too() -> 
 
 async def turn(node: r2p.Node) -> None:
     commands = node.advertise("velocity_cmd", Velocity3, r2p.Sporadic(deadline=0.05))
-    async for _ in node.every(triskar2.COMMANDS):
+    async for _ in node.every(COMMANDS):
         await commands.publish(Velocity3(x=0.2, y=-0.2, w=0.5))
 
 
@@ -250,7 +251,7 @@ async def test_when_a_motor_module_dies_the_others_stop_and_drive_again_with_it(
         pc.start(forward)
         await until_driving(robot)
         await robot.switch_off(name)
-        await asyncio.sleep(triskar2.TIMEOUT + 0.02)
+        await asyncio.sleep(TIMEOUT + 0.02)
         others = [drive for motor, drive in zip(MOTORS, robot.hardware.drives, strict=True) if motor != name]
         assert all(drive.setpoint in (None, 0.0) for drive in others)
         assert await until_at_rest(robot) < 1.0
@@ -266,7 +267,7 @@ async def test_when_the_pc_is_silent_for_3_s_the_motors_stop_and_then_go_on() ->
         async with pc:
             pc.start(forward)
             await until_driving(robot)
-        await asyncio.sleep(triskar2.FRESH + triskar2.TIMEOUT + 0.1)
+        await asyncio.sleep(FRESH + TIMEOUT + 0.1)
         assert all(drive.setpoint is None for drive in robot.hardware.drives)
         assert await until_at_rest(robot) < 1.0
         before = robot.pose
@@ -289,7 +290,7 @@ async def test_a_pc_drives_it_through_the_gateway_which_may_die_and_come_back() 
         await asyncio.sleep(1)
         assert (await odometry.fetch(1)).pose.x > 0.2
         await robot.switch_off("GW")
-        await asyncio.sleep(triskar2.FRESH + triskar2.TIMEOUT + 0.1)
+        await asyncio.sleep(FRESH + TIMEOUT + 0.1)
         assert all(drive.setpoint is None for drive in robot.hardware.drives)
         assert await until_at_rest(robot) < 1.0
         await asyncio.sleep(2)
@@ -306,7 +307,7 @@ async def test_without_eyes_it_does_not_go_where_they_looked() -> None:
         pc.start(functools.partial(forward, speed=-0.5), name="back")
         await until_driving(robot)
         await robot.switch_off("PROX2")
-        await asyncio.sleep(2 * triskar2.FRESH + 0.1)
+        await asyncio.sleep(2 * FRESH + 0.1)
         await until_at_rest(robot, limit=1.0)
         await pc.nodes["back"].stop()
         pc.start(forward)
@@ -334,7 +335,7 @@ async def test_the_battery_monitor_reckons_with_the_current_and_warns_once(caplo
     """Under load the voltage is lower than what the charge would give."""
     readings = [(24_280, 2000), (23_400, 0), (23_300, 0), (25_000, 0), (23_400, 0)]  # mV, mA
     async with r2p.Module("PS") as module, node_in(module) as node:
-        module.start(triskar2.battery_monitor, name="battery")
+        module.start(battery_monitor, name="battery")
         power = node.advertise("power", Battery)
         states = node.subscribe("battery", Battery)
         await power.wait_subscriber()

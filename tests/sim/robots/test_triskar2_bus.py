@@ -16,7 +16,8 @@ from r2p.msg import Velocity3
 from r2p.sim.physics.world import World
 from r2p.sim.robots import triskar2
 from r2p.sim.robots.emulated import MOTORS, Triskar2
-from r2p.sim.robots.triskar2 import Traffic, sender, square
+from r2p.sim.robots.shared_nodes import COMMANDS, FRESH, TIMEOUT, Traffic, sender
+from r2p.sim.robots.triskar2 import square
 from tests.sim.robots.rig import WAIT, odometry_of, until_at_rest, until_driving
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ async def dance(node: r2p.Node, traffic: Traffic) -> None:
     """Command it."""
     time = asyncio.get_running_loop().time
     send = sender(node, "velocity_cmd", Velocity3, lambda: wanted(time()), traffic=traffic, period=triskar2.PERIOD)
-    async for _ in node.every(triskar2.COMMANDS):
+    async for _ in node.every(COMMANDS):
         send()
 
 
@@ -176,7 +177,7 @@ async def test_a_motor_module_off_the_bus(name: str) -> None:
         await until_driving(robot)
         port = sim.can_bus("robot").port(name)
         port.power_off()
-        await asyncio.sleep(triskar2.TIMEOUT + 0.02)
+        await asyncio.sleep(TIMEOUT + 0.02)
         drives = zip(MOTORS, robot.hardware.drives, strict=True)
         assert all(drive.setpoint in (None, 0.0) for motor, drive in drives if motor != name)
         await until_at_rest(robot)
@@ -193,7 +194,7 @@ async def test_the_gateway_without_power_for_3_s() -> None:
         await until_driving(robot)
         port = sim.can_bus("robot").port("GW")
         port.power_off()
-        await asyncio.sleep(triskar2.FRESH + triskar2.TIMEOUT + 0.1)
+        await asyncio.sleep(FRESH + TIMEOUT + 0.1)
         assert all(drive.setpoint is None for drive in robot.hardware.drives)
         await until_at_rest(robot)
         await asyncio.sleep(2.5)

@@ -15,11 +15,11 @@ import msgspec
 
 import r2p
 from r2p.messages import i16
-from r2p.msg import AbsoluteEncoder, Odometry, Pose3, Velocity3
+from r2p.msg import AbsoluteEncoder, Odometry, Velocity3
 from r2p.sim.physics.legs import LegSpec, moved
 from r2p.sim.physics.motor import Drive
 from r2p.sim.physics.world import Triple
-from r2p.sim.robots.triskar2 import COMMANDS, FRESH, Latest
+from r2p.sim.robots.shared_nodes import COMMANDS, FRESH, DeadReckoning, Latest
 
 LEGS = ("lf", "lm", "lr", "rf", "rm", "rr")
 """Left and right: front, middle, rear."""
@@ -148,8 +148,7 @@ async def legged_odometry(node: r2p.Node, body: LegSpec = BODY, period: float = 
     angles: list[list[float | None]] = [[None] * JOINTS for _ in LEGS]
     waits = len(LEGS) * JOINTS
     odometry = node.advertise("odometry", Odometry, r2p.Sporadic(deadline=_ROUNDS * period))
-    pose, last, rounds = Pose3(), None, 0
-    x = y = w = 0.0
+    reckoning, last, rounds = DeadReckoning(), None, 0
 
     def read(leg: int, joint: int, message: AbsoluteEncoder) -> None:
         nonlocal waits
@@ -169,16 +168,11 @@ async def legged_odometry(node: r2p.Node, body: LegSpec = BODY, period: float = 
         if last is not None:
             ground = min(min(old[2], new[2]) for old, new in zip(last, feet, strict=True)) + body.touching
             stand = [(old, new) for old, new in zip(last, feet, strict=True) if max(old[2], new[2]) <= ground]
-            dx, dy, dw = moved(stand)
-            heading = pose.w + dw / 2
-            cos, sin = math.cos(heading), math.sin(heading)
-            pose = Pose3(pose.x + dx * cos - dy * sin, pose.y + dx * sin + dy * cos, pose.w + dw)
-            x, y, w, rounds = x + dx, y + dy, w + dw, rounds + 1
+            reckoning.move(*moved(stand))
+            rounds += 1
         last = feet
         if rounds == _ROUNDS:
-            span = rounds * period
-            odometry.publish_nowait(Odometry(pose, Velocity3(x / span, y / span, w / span)))
-            x = y = w = 0.0
+            odometry.publish_nowait(Odometry(reckoning.pose, reckoning.velocity(rounds * period)))
             rounds = 0
 
 

@@ -18,9 +18,9 @@ from r2p.sim.modules.boards import MotorConfig, MotorModule, Plant, PowerModule
 from r2p.sim.physics.legs import JOINT_MOTOR, Joint, Legs, LegSpec
 from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor
 from r2p.sim.physics.world import Triple
-from r2p.sim.robots import triskar2
 from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotOptions
 from r2p.sim.robots.hexapod import nodes
+from r2p.sim.robots.shared_nodes import BATTERY, battery_monitor
 from r2p.sim.transport import can_bus
 from r2p.transports.link import Transport
 from r2p.transports.url import parse
@@ -51,7 +51,7 @@ class HexapodHardware:
             for motor, angle in zip(self.motors[nodes.JOINTS * leg :], home, strict=False):
                 motor.angle = angle + numbers.uniform(0.0, _ASSEMBLED)
         self.body = Legs(spec, [Joint(motor, spec.link_inertia) for motor in self.motors])
-        self.battery = LeadBattery(triskar2.BATTERY)
+        self.battery = LeadBattery(BATTERY)
         self.plant = Plant([*self.drives, self.body, self], dt=STEP)
 
     def step(self, dt: float) -> None:
@@ -82,7 +82,7 @@ class Hexapod(EmulatedRobot):
         }
         boards["LM1"] = BoardPlan(self._motor, {**boards["LM1"].nodes, "gait": nodes.gait})
         boards["RM1"] = BoardPlan(self._motor, {**boards["RM1"].nodes, "odometry": nodes.legged_odometry})
-        boards["PS"] = BoardPlan(self._power_supply, {"battery": triskar2.battery_monitor})
+        boards["PS"] = BoardPlan(self._power_supply, {"battery": battery_monitor})
         boards["GW"] = BoardPlan(self.make_gateway)
         super().__init__(via, self.hardware.plant, boards, **options)
 

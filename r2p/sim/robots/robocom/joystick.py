@@ -15,7 +15,7 @@ from typing import Final
 
 import r2p
 from r2p.msg import Velocity3
-from r2p.sim.robots.triskar2 import COMMANDS
+from r2p.sim.robots.shared_nodes import COMMANDS
 
 _EVENT: Final = struct.Struct("<IhBB")  # of the kernel's joystick interface: time (ms), value, type, number
 _AXIS, _INITIAL = 2, 128  # bits of the type; initial: not a movement, but where it is when the device is opened

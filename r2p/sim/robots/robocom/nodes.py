@@ -3,16 +3,16 @@
     velocity -> invkin -> speed -> two motor modules -> encoder_left, encoder_right -> fwdkin -> odometry
 
 They use only the public API, so each of them runs on any module. The nodes that sample encoders, inertial sensors and
-GPS are those of the modules (`r2p.sim.modules.stamped`); the battery monitor is Triskar2's.
+GPS are those of the modules (`r2p.sim.modules.stamped`); the battery monitor is in `r2p.sim.robots.shared_nodes`.
 """
 
 import math
 
 import r2p
-from r2p.msg import Pose3, Speed2, StampedEncoder, StampedOdometry, Timestamp, Velocity3
+from r2p.msg import Speed2, StampedEncoder, StampedOdometry, Timestamp, Velocity3
 from r2p.sim.physics.differential import DifferentialSpec
 from r2p.sim.physics.motor import BatterySpec, MotorSpec
-from r2p.sim.robots.triskar2 import COMMANDS, FRESH, Latest
+from r2p.sim.robots.shared_nodes import COMMANDS, FRESH, DeadReckoning, Latest
 from r2p.units import SECOND
 
 BODY = DifferentialSpec()
@@ -110,25 +110,21 @@ async def forward_kinematics(node: r2p.Node, body: DifferentialSpec = BODY, moto
     left, right = _Wheel(), _Wheel()
     for topic, wheel in zip(ENCODERS, (left, right), strict=True):
         node.subscribe(topic, StampedEncoder, wheel.add, queue=250)  # a lost one would distort the odometry
-    pose = Pose3()
+    reckoning = DeadReckoning()
     before, begun, rounds = (0.0, 0.0), 0, 0
-    ahead = turned = 0.0  # since the last message, m and rad
     while True:
         await node.spin()
         for stamp in [each for each in left.until if each in right.until]:
             now = left.take(stamp) / motor.ticks_per_radian, right.take(stamp) / motor.ticks_per_radian
-            dx, dw = body.body_velocity(now[0] - before[0], now[1] - before[1])
-            heading = pose.w + dw / 2
-            pose = Pose3(pose.x + dx * math.cos(heading), pose.y + dx * math.sin(heading), pose.w + dw)
+            reckoning.move(*body.body_velocity(now[0] - before[0], now[1] - before[1]))
             before, rounds = now, rounds + 1
-            ahead, turned = ahead + dx, turned + dw
             if rounds < _ROUNDS:
                 continue
             time = Timestamp(*stamp)
             span = (time.ns - begun) / SECOND
-            if begun and span > 0:
-                odometry.publish_nowait(StampedOdometry(time, pose, Velocity3(x=ahead / span, w=turned / span)))
-            ahead = turned = 0.0
+            velocity = reckoning.velocity(span or PERIOD)
+            if begun and span > 0:  # not if the network's time began anew
+                odometry.publish_nowait(StampedOdometry(time, reckoning.pose, velocity))
             begun, rounds = time.ns, 0
 
 

@@ -26,9 +26,9 @@ from r2p.sim.physics.gps import GpsReceiver, GpsSpec, GpsTruth
 from r2p.sim.physics.inertial import GRAVITY
 from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor, speed_gains
 from r2p.sim.physics.world import Triple
-from r2p.sim.robots import triskar2
 from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotOptions
 from r2p.sim.robots.robocom import nodes
+from r2p.sim.robots.shared_nodes import TIMEOUT, battery_monitor
 from r2p.transports.link import Transport
 from r2p.units import SECOND
 
@@ -165,9 +165,7 @@ class Robocom(EmulatedRobot):
                     "gps": functools.partial(stamped.gps, receiver=hardware.receiver, topic="gps"),
                 },
             ),
-            "PS": BoardPlan(
-                self._power_supply, {"battery": functools.partial(triskar2.battery_monitor, spec=nodes.BATTERY)}
-            ),
+            "PS": BoardPlan(self._power_supply, {"battery": functools.partial(battery_monitor, spec=nodes.BATTERY)}),
             "GW": BoardPlan(self.make_gateway, {"truth": self._truth} if truth else {}),
         }
         super().__init__(via, hardware.plant, boards, **options)
@@ -206,7 +204,7 @@ class Robocom(EmulatedRobot):
             setpoint="speed",
             message=Speed2,
             ticks=lambda speeds: speeds.value[wheel] * ticks,
-            timeout=triskar2.TIMEOUT,
+            timeout=TIMEOUT,
             encoder="",
             current=f"current{wheel + 1}",
         )

@@ -7,7 +7,7 @@
 
 Velocity control leans the robot: forward to go faster, back to go slower. Balance control keeps it at that tilt, by
 what the motors are to exert, and adds what turns it to one wheel and subtracts it from the other. Both run on the IMU
-module, and use only the public API. Forward kinematics and battery monitor are those of Triskar2.
+module, and use only the public API. Forward kinematics and battery monitor are in `r2p.sim.robots.shared_nodes`.
 """
 
 import functools
@@ -27,7 +27,7 @@ from r2p.sim.physics.pendulum import (
     TORQUE_MOTOR,
     PendulumSpec,
 )
-from r2p.sim.robots.triskar2 import FRESH, Latest, Traffic, sender
+from r2p.sim.robots.shared_nodes import FRESH, Latest, Traffic, sender
 
 PERIOD = 0.01
 """Period of the tilt, of the balance control and of the encoders, s."""

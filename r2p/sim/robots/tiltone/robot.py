@@ -33,8 +33,8 @@ from r2p.sim.physics.inertial import (
 from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor
 from r2p.sim.physics.pendulum import Pendulum
 from r2p.sim.physics.world import Triple
-from r2p.sim.robots import triskar2
 from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotOptions
+from r2p.sim.robots.shared_nodes import BATTERY, Traffic, battery_monitor, forward_kinematics
 from r2p.sim.robots.tiltone import nodes
 from r2p.transports.link import Transport
 
@@ -96,7 +96,7 @@ class TiltOneHardware:
         self.body.held = True
         limit = Gains(0.0, limit=spec.motor.voltage)
         self.drives = [Drive(motor, limit, mode=spec.mode) for motor in self.motors]
-        self.battery = LeadBattery(triskar2.BATTERY)
+        self.battery = LeadBattery(BATTERY)
         self.inertial = InertialUnit(
             self._motion,
             self.noise("IMU1"),
@@ -175,7 +175,7 @@ class TiltOne(EmulatedRobot):
         seed: object = 0,
         spec: nodes.BalanceSpec = nodes.GEARED,
         payload: float = 0.0,
-        traffic: triskar2.Traffic = "hrt",
+        traffic: Traffic = "hrt",
         on_input: Callable[[ControlInput], object] | None = None,
         **options: Unpack[RobotOptions],
     ) -> None:
@@ -186,7 +186,7 @@ class TiltOne(EmulatedRobot):
         self._clock: Clock | None = None
         chain: dict[str, Any] = {"spec": spec, "traffic": traffic}
         kinematics = functools.partial(
-            triskar2.forward_kinematics,
+            forward_kinematics,
             body_velocity=spec.body.body_velocity,
             wheels=len(MOTORS),
             motor=spec.motor,
@@ -203,7 +203,7 @@ class TiltOne(EmulatedRobot):
                     "balance": functools.partial(nodes.balance_control, **chain),
                 },
             ),
-            "PS": BoardPlan(self._power_supply, {"battery": triskar2.battery_monitor}),
+            "PS": BoardPlan(self._power_supply, {"battery": battery_monitor}),
             "GW": BoardPlan(self.make_gateway),
         }
         super().__init__(via, self.hardware.plant, boards, **options)

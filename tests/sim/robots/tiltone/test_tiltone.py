@@ -23,7 +23,7 @@ from tests.sim.robots.rig import odometry_of
 from tests.sim.robots.tiltone.rig import VIA, Rider, standing
 
 if TYPE_CHECKING:
-    from r2p.sim.robots.triskar2 import Traffic
+    from r2p.sim.robots.shared_nodes import Traffic
 
 pytestmark = pytest.mark.virtual_time
 
