@@ -34,10 +34,10 @@ VIA = "memory:robot"
 
 
 NODES = {
-    "obstacle_avoidance": r2p.PublisherClass.SPORADIC,
-    "inverse_kinematics": r2p.PublisherClass.PERIODIC,
-    "forward_kinematics": r2p.PublisherClass.SPORADIC,
-    "battery_monitor": r2p.PublisherClass.NON_REAL_TIME,
+    "triskar2:obstacle_avoidance": r2p.PublisherClass.SPORADIC,
+    "triskar2:inverse_kinematics": r2p.PublisherClass.PERIODIC,
+    "triskar2:forward_kinematics": r2p.PublisherClass.SPORADIC,
+    "shared_nodes:battery_monitor": r2p.PublisherClass.NON_REAL_TIME,
 }
 """And how each of them publishes."""
 
@@ -388,7 +388,7 @@ async def test_odometry_makes_up_for_a_second_in_which_the_computer_was_busy() -
 
 @pytest.mark.parametrize("name", NODES)
 async def test_each_node_is_short_and_runs_anywhere(name: str) -> None:
-    (program,) = load([f"r2p.sim.robots.triskar2:{name}=node"])
+    (program,) = load([f"r2p.sim.robots.{name}=node"])
     assert len(inspect.getsource(program.function).splitlines()) < 60
     async with r2p.Module("PC1") as module:
         node = module.start(program.function, name=program.name)
