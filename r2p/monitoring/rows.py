@@ -1,6 +1,6 @@
 """The rows of a snapshot: what is announced of topics, modules and services, with what is counted and measured.
 
-A row that is equal to the one before is the same object, so who shows it sees at once what has changed.
+A row that is equal to the one before is the same object, so a display sees at once what has changed.
 """
 
 import contextlib

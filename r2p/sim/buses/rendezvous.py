@@ -5,8 +5,8 @@
     served = find("lab")                                        # a client: None, or where to connect
 
 A server holds a lock on its file, which ends with its process, however that ends. So a file without a lock is stale,
-and the next server of that name removes it. Clients don't look at locks: nobody listens at the port of a stale file, or
-a program that does not know the secret.
+and the next server of that name removes it. Clients don't look at locks: at the port of a stale file no program
+listens, or one that does not know the secret.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Who takes part in the traffic of a bus: the controllers that listen, and those on their way out of bus-off."""
+"""What takes part in the traffic of a bus: the controllers that listen, and those on their way out of bus-off."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class TiltOneFigures(msgspec.Struct, frozen=True):
 
 
 class TiltOneDisplay(RobotDisplay[TiltOneFigures]):
-    """tiltOne on a floor without an end; whoever publishes `shove` hits it."""
+    """tiltOne on a floor without an end. A message of `shove` hits it."""
 
     robot_class = TiltOne
     robot: TiltOne
@@ -171,7 +171,7 @@ class TiltOneDisplay(RobotDisplay[TiltOneFigures]):
         self.robot.shove(impulse)
 
     async def _look(self, node: r2p.Node) -> None:
-        """Receive what the robot is told and how it is to lean, and shoves."""
+        """Receive the commands of its velocity and of its tilt, and shoves."""
         self._wanted = Latest(node, "tilt_setpoint", Tilt, fresh=FRESH)
         self._command = Latest(node, "velocity", Velocity3, fresh=FRESH)
         node.subscribe("shove", Float32, lambda shove: self._shove(shove.data))

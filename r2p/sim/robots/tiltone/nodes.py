@@ -51,7 +51,7 @@ class BalanceSpec(msgspec.Struct, frozen=True, kw_only=True):
     body: PendulumSpec = TILTONE
     motor: MotorSpec = TILTONE_MOTOR
     mode: Literal["voltage", "torque"] = "voltage"
-    """What the motor modules are told, of each motor: its voltage, or its torque at the wheel."""
+    """What is commanded of each motor: its voltage, or its torque at the wheel."""
     balance: Gains = Gains(kp=120.0, ki=200.0, kd=8.0, limit=24.0)
     """Effort per rad, rad s and rad/s of the tilt."""
     velocity: Gains = Gains(kp=0.15, ki=0.003, limit=math.radians(8))
