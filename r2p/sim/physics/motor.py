@@ -6,6 +6,7 @@ the motor module's firmware, from the encoder to the bridge (thesis 7.3.2), with
 """
 
 import math
+from collections.abc import Iterable
 from typing import Literal
 
 import msgspec
@@ -195,6 +196,13 @@ def speed_gains(spec: MotorSpec, load: float, *, frequency: float, damping: floa
     return Gains((2 * damping * frequency * time - 1) / gain, frequency**2 * time / gain, limit=spec.voltage)
 
 
+def rounded_gains(gains: Gains, spec: MotorSpec) -> Gains:
+    """Return gains with two digits per radian of the wheel, as they are typed: 1.9 V/(rad/s) and 30 V/rad."""
+    ticks = spec.ticks_per_radian
+    kp, ki = (float(f"{each * ticks:.2g}") / ticks for each in (gains.kp, gains.ki))
+    return Gains(kp, ki, limit=gains.limit)
+
+
 class Drive:
     """Control of one motor; without a setpoint the winding is shorted, which brakes.
 
@@ -290,6 +298,12 @@ class LeadBattery:
         spec = self.spec
         rest = spec.empty + (spec.full - spec.empty) * self.charge
         return rest - self.current * spec.resistance * 1e-3
+
+    def supply(self, motors: Iterable[Motor], electronics: float, dt: float) -> None:
+        """Advance by `dt` seconds with what motors draw, and the modules: `electronics` in A."""
+        power = sum(motor.voltage * motor.current for motor in motors)
+        self.current = electronics + power / self.voltage
+        self.step(dt)
 
     def step(self, dt: float) -> None:
         """Advance by `dt` seconds at the present current."""

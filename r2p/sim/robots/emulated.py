@@ -33,7 +33,7 @@ from r2p.sim.modules.sensors import (
     SonarModule,
 )
 from r2p.sim.physics.inertial import ACCELEROMETER, GRAVITY, Vector
-from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor, speed_gains
+from r2p.sim.physics.motor import Drive, LeadBattery, Motor, rounded_gains, speed_gains
 from r2p.sim.physics.ultrasonic import Beam, SonarSpec, echo
 from r2p.sim.physics.world import OmniBody, Triple, World
 from r2p.sim.robots import triskar2
@@ -87,7 +87,8 @@ class Hardware:
         self.world = world or World()
         self.motors = [Motor(triskar2.MOTOR) for _ in MOTORS]
         self.body = OmniBody(triskar2.BODY, self.motors, self.noise("body"))
-        gains = _rounded(speed_gains(triskar2.MOTOR, self.body.own, frequency=FREQUENCY, damping=DAMPING))
+        exact = speed_gains(triskar2.MOTOR, self.body.own, frequency=FREQUENCY, damping=DAMPING)
+        gains = rounded_gains(exact, triskar2.MOTOR)
         self.drives = [Drive(motor, gains) for motor in self.motors]
         self.battery = LeadBattery(BATTERY)
         self.pins = Pins()
@@ -103,9 +104,7 @@ class Hardware:
 
     def step(self, dt: float) -> None:
         """Drain the battery by motors and modules for `dt` seconds, after drives and body, and read the thermometer."""
-        power = sum(motor.voltage * motor.current for motor in self.motors)
-        self.battery.current = _ELECTRONICS + power / self.battery.voltage
-        self.battery.step(dt)
+        self.battery.supply(self.motors, _ELECTRONICS, dt)
         self.pins.inputs[0] = _THERMOMETER[0] + _THERMOMETER[1] * self.world.temperature
 
     def add(self, part: Part) -> None:
@@ -159,13 +158,6 @@ async def cube(node: r2p.Node, hardware: Hardware) -> None:
     doc = "The side of the sensors that is up: z as they are mounted, others on a cube to calibrate them"
     turn(node.parameter("up", Side["z"], doc=doc, on_change=turn).value)
     await asyncio.Event().wait()
-
-
-def _rounded(gains: Gains) -> Gains:
-    """Return gains with two digits per radian of the wheel, as they are typed: 1.9 V/(rad/s) and 30 V/rad."""
-    ticks = triskar2.MOTOR.ticks_per_radian
-    kp, ki = (float(f"{each * ticks:.2g}") / ticks for each in (gains.kp, gains.ki))
-    return Gains(kp, ki, limit=gains.limit)
 
 
 class Triskar2(EmulatedRobot):

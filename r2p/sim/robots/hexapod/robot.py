@@ -56,9 +56,7 @@ class HexapodHardware:
 
     def step(self, dt: float) -> None:
         """Draw the current of motors and modules from the battery for `dt` seconds, after drives and legs."""
-        power = sum(motor.voltage * motor.current for motor in self.motors)
-        self.battery.current = _ELECTRONICS + power / self.battery.voltage
-        self.battery.step(dt)
+        self.battery.supply(self.motors, _ELECTRONICS, dt)
 
 
 class Hexapod(EmulatedRobot):

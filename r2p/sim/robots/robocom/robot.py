@@ -24,7 +24,7 @@ from r2p.sim.modules.sensors import ImuModule, InertialUnit, Motion
 from r2p.sim.physics.differential import DifferentialBody
 from r2p.sim.physics.gps import GpsReceiver, GpsSpec, GpsTruth
 from r2p.sim.physics.inertial import GRAVITY
-from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor, speed_gains
+from r2p.sim.physics.motor import Drive, LeadBattery, Motor, rounded_gains, speed_gains
 from r2p.sim.physics.world import Triple
 from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotOptions
 from r2p.sim.robots.robocom import nodes
@@ -72,7 +72,8 @@ class RobocomHardware:
         self.clock = clock_of()
         self.motors = [Motor(nodes.MOTOR) for _ in MOTORS]
         self.body = DifferentialBody(nodes.BODY, self.motors, self.noise("body"))
-        gains = _rounded(speed_gains(nodes.MOTOR, self.body.ahead, frequency=FREQUENCY, damping=DAMPING))
+        exact = speed_gains(nodes.MOTOR, self.body.ahead, frequency=FREQUENCY, damping=DAMPING)
+        gains = rounded_gains(exact, nodes.MOTOR)
         self.drives = [Drive(motor, gains) for motor in self.motors]
         self.unit = InertialUnit(self._motion, self.noise("imu"))
         self.receiver = GpsReceiver(gps or GpsSpec(), self._antenna, self.clock.now, self.noise("gps"))
@@ -84,9 +85,7 @@ class RobocomHardware:
 
     def step(self, dt: float) -> None:
         """Draw the current of motors and modules from the battery for `dt` seconds, after all others."""
-        power = sum(motor.voltage * motor.current for motor in self.motors)
-        self.battery.current = _ELECTRONICS + power / self.battery.voltage
-        self.battery.step(dt)
+        self.battery.supply(self.motors, _ELECTRONICS, dt)
         self._stepped = self.clock.monotonic()
 
     def ticks(self, wheel: int) -> int:
@@ -121,13 +120,6 @@ class RobocomHardware:
         body = self.body
         v = body.velocity[0]
         return GpsTruth(body.x, body.y, v * math.cos(body.w), v * math.sin(body.w))
-
-
-def _rounded(gains: Gains) -> Gains:
-    """Return gains with two digits per radian of the wheel, as they are typed."""
-    ticks = nodes.MOTOR.ticks_per_radian
-    kp, ki = (float(f"{each * ticks:.2g}") / ticks for each in (gains.kp, gains.ki))
-    return Gains(kp, ki, limit=gains.limit)
 
 
 class Robocom(EmulatedRobot):

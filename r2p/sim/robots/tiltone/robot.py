@@ -109,9 +109,7 @@ class TiltOneHardware:
 
     def step(self, dt: float) -> None:
         """Draw the current of motors and modules from the battery for `dt` seconds, after drives and body."""
-        power = sum(motor.voltage * motor.current for motor in self.motors)
-        self.battery.current = _ELECTRONICS + power / self.battery.voltage
-        self.battery.step(dt)
+        self.battery.supply(self.motors, _ELECTRONICS, dt)
         if self._raising:
             self._raise(dt)
 
