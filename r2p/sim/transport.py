@@ -13,6 +13,7 @@ the bus is in a thread of its own, and modules connect to it through python-can.
 """
 
 import asyncio
+import os
 import threading
 import weakref
 from abc import ABC, abstractmethod
@@ -65,7 +66,9 @@ class SimCan:
     numbers.
     """
 
-    def __init__(self, *, bitrate: int = 1_000_000, noise: float = 0.0, seed: int | None = None) -> None:
+    def __init__(
+        self, *, bitrate: int = 1_000_000, noise: float = 0.0, seed: int | None = None, hosted: bool = False
+    ) -> None:
         loop = asyncio.get_running_loop()
         numbers = random_of(loop).getrandbits(32) if seed is None else seed
         self.bus = CanBus(loop, bitrate=bitrate, noise=noise, seed=numbers)
@@ -74,7 +77,7 @@ class SimCan:
         self._epoch = clock.now() - clock.monotonic()  # once: so differences of stamps are exact
         self.powered = True
         """True if modules that connect have power."""
-        self.hosted = False
+        self.hosted = hosted
         """True if the bus has an event loop of its own, in a thread: programs use it by `r2p.sim.buses.attach`."""
         self._nodes: dict[str, PluggedNode] = {}
         self._unplugged: dict[str, CanController] = {}
@@ -335,6 +338,14 @@ def can_bus(name: str, **options: Any) -> SimCan:
         return shared
 
 
+def forget_bus(shared: SimCan) -> None:
+    """Let no module and no program find this bus any more: its loop is about to end."""
+    with _buses_lock:
+        buses = _buses[shared.loop]
+        for name in [name for name, each in buses.items() if each is shared]:
+            del buses[name]
+
+
 def _hosted_bus(name: str) -> SimCan | None:
     """Return the bus of this name that runs in a thread of its own, if it is not the running loop's thread."""
     loop = asyncio.get_running_loop()
@@ -355,6 +366,16 @@ def running_buses() -> list[tuple[str, SimCan]]:
 
 def _in_real_time(loop: asyncio.AbstractEventLoop) -> bool:
     return not isinstance(loop, VirtualLoop) or loop.clock.paced
+
+
+def _after_fork() -> None:
+    global _buses_lock
+    _buses_lock = threading.Lock()  # another thread may have held it
+    _buses.clear()  # their loops run in the other process
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def from_url(url: Url) -> SimTransport:

@@ -10,9 +10,11 @@ from collections.abc import Sequence
 
 import msgspec
 
+from r2p.clock import SystemClock
 from r2p.codecs.can_bits import AnyFrame
 from r2p.errors import MessageError
 from r2p.sim.can import ControllerState, ErrorKind
+from r2p.units import SECOND
 
 TX_QUEUE = 128
 """Frames that wait for the wire in an attachment; those that the controller holds count as well."""
@@ -23,6 +25,15 @@ RX_QUEUE = 10_000
 BITRATE = 1_000_000
 """Bit/s of a bus that is made by an attachment which asks for no bit rate."""
 
+FILTERS_MAX = 512
+"""Filters of an attachment, at most: as many as Linux allows."""
+
+_TIMEOUT_MAX = 1e9  # s
+_IDENTIFIER_MAX = (1 << 32) - 1
+_DRIFT_BELOW = 1_000_000  # ppm: a clock that goes backwards, or twice as fast
+_OFFSET_MAX = 1_000_000_000 * SECOND  # some thirty years: stamps have 64 bits
+_clock = SystemClock()
+
 
 class BusFilter(msgspec.Struct, frozen=True):
     """Passes frames with `id & mask == value & mask`; `extended` chooses 29 bits, or 11, None takes both."""
@@ -30,6 +41,14 @@ class BusFilter(msgspec.Struct, frozen=True):
     value: int
     mask: int
     extended: bool | None = None
+
+    def __post_init__(self) -> None:
+        numbers: tuple[object, ...] = self.value, self.mask
+        for number in numbers:
+            if not isinstance(number, int) or not 0 <= number <= _IDENTIFIER_MAX:
+                raise MessageError(f"a filter has an identifier and a mask of at most 32 bits, not {number!r}")
+        if self.extended not in (None, False, True):
+            raise MessageError(f"a filter chooses extended identifiers by True, False or None, not {self.extended!r}")
 
     def passes(self, frame: AnyFrame) -> bool:
         """Return whether a frame passes."""
@@ -79,6 +98,28 @@ class AttachmentOptions(msgspec.Struct, frozen=True, kw_only=True):
                 raise MessageError(f"{name} is a share, 0.0 to 1.0, not {share}")
         if self.rx_queue < 1:
             raise MessageError(f"at least one frame has to fit the queue of received frames, not {self.rx_queue}")
+        if not abs(self.drift_ppm) < _DRIFT_BELOW:
+            raise MessageError(f"a clock drifts by less than {_DRIFT_BELOW} ppm, not {self.drift_ppm}")
+        if abs(self.offset) > _OFFSET_MAX:
+            raise MessageError(f"a clock's offset is at most {_OFFSET_MAX // SECOND} s")
+        check_filters(self.filters)
+
+
+def check_filters(filters: Sequence[BusFilter]) -> tuple[BusFilter, ...]:
+    """Return these filters. Raises `MessageError` if there are too many."""
+    if len(filters) > FILTERS_MAX:
+        raise MessageError(f"{len(filters)} filters, of {FILTERS_MAX} at most: give some of them one mask")
+    return tuple(filters)
+
+
+def deadline_of(timeout: float | None) -> int | None:
+    """Return when a call gives up that may take `timeout` seconds: by the system's monotonic clock, in ns; None: never.
+
+    What is below 0, or not a number, is 0.
+    """
+    if timeout is None:
+        return None
+    return _clock.monotonic() + round(max(0.0, min(timeout, _TIMEOUT_MAX)) * SECOND)  # in this order: max(0, nan) is 0
 
 
 class BusFrame(msgspec.Struct, frozen=True, gc=False):
@@ -133,7 +174,10 @@ class BusAttachment(ABC):
 
     @abstractmethod
     def set_filters(self, filters: Sequence[BusFilter]) -> None:
-        """Receive frames that pass one of these, from now on; all if there is none. Errors always pass."""
+        """Receive frames that pass one of these, from now on; all if there is none. Errors always pass.
+
+        Raises `MessageError` for more than `FILTERS_MAX`.
+        """
 
     @property
     @abstractmethod

@@ -70,7 +70,9 @@ def filters_of(filters: Iterable[Any] | None) -> tuple[BusFilter, ...]:
     for each in filters or ():
         try:
             found.append(BusFilter(each["can_id"], each["can_mask"], each.get("extended")))
-        except (KeyError, TypeError, AttributeError) as error:
+        except MessageError:
+            raise
+        except (KeyError, TypeError, AttributeError, IndexError) as error:
             raise MessageError(f'a filter is a dict with "can_id" and "can_mask", not {each!r}') from error
     return tuple(found)
 

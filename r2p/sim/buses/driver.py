@@ -69,11 +69,10 @@ class BusDriver(PluggedNode):
     def flush(self) -> None:
         """Empty the queue, but for a frame whose start of frame has begun."""
         self.shared.bus.timeline.catch_up()
-        held = self.sending and not self.controller.abort()
-        kept = [self.queue[0]] if held else []
-        self.queue.clear()
-        self.queue.extend(kept)
-        self.sending = held
+        self.sending = self.sending and not self.controller.abort()
+        waiting = [self.queue.popleft() for _ in range(len(self.queue))]  # not clear(): other threads append meanwhile
+        self.queue.extendleft(waiting[: self.sending])
+        self._next()
         self._on_room()
 
     def restart(self) -> None:

@@ -23,11 +23,20 @@ from r2p.clock import SystemClock
 from r2p.codecs.can_bits import FRAME_MAX, IDENTIFIER_BITS, Frame, check_frame
 from r2p.errors import Closed, Error, TransportError
 from r2p.log_lines import get_logger
-from r2p.sim.buses.attachment import BITRATE, TX_QUEUE, AttachmentOptions, BusAttachment, BusFilter, BusFrame
+from r2p.sim.buses.attachment import (
+    BITRATE,
+    TX_QUEUE,
+    AttachmentOptions,
+    BusAttachment,
+    BusFilter,
+    BusFrame,
+    check_filters,
+    deadline_of,
+)
 from r2p.sim.buses.driver import BusDriver
 from r2p.sim.can import ControllerState
 from r2p.sim.loop import VirtualLoop
-from r2p.sim.transport import SimCan, can_bus, running_buses
+from r2p.sim.transport import SimCan, can_bus, forget_bus, running_buses
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
@@ -43,6 +52,7 @@ _ANSWER_S: Final = 5.0  # for the loop that runs the bus, if that is a loop of t
 _STALLED_S: Final = 1.0  # without a frame that leaves a full queue, until a sender that would wait forever gives up
 _LOW_WATER: Final = TX_QUEUE - 16  # frames in the queue when senders that wait go on: one wake-up for many frames
 _SELECT_MAX: Final = 1024  # descriptors that select() has
+_CLOSED: Final = "closed"
 _FORKED: Final = "this process was forked from the one that opened the bus: open buses after the fork"
 _clock: Final = SystemClock()
 
@@ -107,6 +117,8 @@ class LocalAttachment(BusAttachment):
         driver.pump()
 
     def receive(self, timeout: float | None = None) -> BusFrame | None:
+        if self._ended == _CLOSED:
+            self._check()
         try:
             if timeout == 0 or self._still or threading.get_ident() == self._thread:
                 event = self._receive_now(timeout)
@@ -127,7 +139,7 @@ class LocalAttachment(BusAttachment):
         return event
 
     def set_filters(self, filters: Sequence[BusFilter]) -> None:
-        self._call(self._driver.set_filters, filters)
+        self._order(self._driver.set_filters, check_filters(filters))
 
     @property
     def state(self) -> ControllerState:
@@ -142,10 +154,10 @@ class LocalAttachment(BusAttachment):
         return self._lost
 
     def flush(self) -> None:
-        self._call(self._driver.flush)
+        self._order(self._driver.flush)
 
     def restart(self) -> None:
-        self._call(self._driver.restart)
+        self._order(self._driver.restart)
 
     def here(self) -> asyncio.AbstractEventLoop | None:
         return self._loop if self._runs_here() else None
@@ -165,11 +177,14 @@ class LocalAttachment(BusAttachment):
                 if self._ready is not None:  # the loop has ended before
                     self._ready.close()
                 return
-            self._ended = "closed"
+            self._ended = _CLOSED
         _attachments.discard(self)
-        with contextlib.suppress(TransportError):  # the loop has ended, or does not answer: nothing comes from it
-            self._call(self._stop)
-        self._end("closed")
+        with contextlib.suppress(TransportError):  # the loop has ended
+            try:
+                self._call(self._stop)
+            except TransportError:  # it does not answer: when it goes on, the node leaves
+                self._soon(self._stop)
+        self._end(_CLOSED)
         if self._ready is not None:
             self._ready.close()
         if self._release is not None:
@@ -184,7 +199,7 @@ class LocalAttachment(BusAttachment):
 
     def _check(self) -> None:
         if self._ended is not None:
-            kind = Closed if self._ended == "closed" else TransportError
+            kind = Closed if self._ended == _CLOSED else TransportError
             raise kind(f"{self.description}: {self._ended}")
 
     def _receive_now(self, timeout: float | None) -> BusFrame | None:
@@ -201,7 +216,7 @@ class LocalAttachment(BusAttachment):
     def _wait_for_room(self, driver: BusDriver, timeout: float | None) -> None:
         """Wait until the queue has room; called with the condition's lock. Raises TimeoutError."""
         waits = timeout != 0 and not self._still and threading.get_ident() != self._thread
-        deadline = None if timeout is None else _clock.monotonic() + round(timeout * SECOND)
+        deadline = deadline_of(timeout)
         stalls = 0
         self._senders += 1
         try:
@@ -228,15 +243,24 @@ class LocalAttachment(BusAttachment):
             return ": await asyncio.sleep(...) between frames, as the bus needs time to send them"
         return ""
 
+    def _order(self, function: Callable[..., object], *args: Any) -> None:
+        self._check()
+        self._call(function, *args)
+
     def _call(self, function: Callable[..., T], *args: Any) -> T:
-        """Call this in the bus's loop and return its result. Raises TransportError if the loop has ended."""
-        if self._runs_here():
+        """Call this in the bus's loop and return its result.
+
+        Raises TransportError if the loop has ended, or does not answer: then it is not called later, either.
+        """
+        if self._runs_here() or self._rests_here():
             return function(*args)
         answer: concurrent.futures.Future[T] = concurrent.futures.Future()
         self._soon(_answer, answer, function, args)
         try:
             return answer.result(_ANSWER_S)
         except concurrent.futures.TimeoutError:
+            if not answer.cancel():
+                return answer.result()  # it has just begun
             raise TransportError(f"{self.description}: its event loop does not answer: something blocks it") from None
 
     def _runs_here(self) -> bool:
@@ -244,6 +268,10 @@ class LocalAttachment(BusAttachment):
             return asyncio.get_running_loop() is self._loop
         except RuntimeError:
             return False
+
+    def _rests_here(self) -> bool:
+        """Return whether this thread ran the loop, and will again, as after `run_until_complete`: nobody else does."""
+        return threading.get_ident() == self._thread and not self._loop.is_running() and not self._loop.is_closed()
 
     def _soon(self, function: Callable[..., object], *args: Any) -> None:
         try:
@@ -380,8 +408,7 @@ class BusThread:
     def _open(self, options: AttachmentOptions) -> None:
         try:
             given = {"bitrate": options.bitrate or BITRATE, "noise": options.noise, "seed": options.seed}
-            self.shared = can_bus(self.channel, **given)
-            self.shared.hosted = True
+            self.shared = can_bus(self.channel, hosted=True, **given)
         finally:
             self._started.set()
 
@@ -435,7 +462,7 @@ def attach_to_thread(channel: str, options: AttachmentOptions) -> LocalAttachmen
             last = thread.users == 0
             if last:
                 _threads.pop(channel, None)
-                thread.shared.hosted = False
+                forget_bus(thread.shared)  # now: nobody attaches to a loop that is about to end
         if last:
             thread.stop()
 
@@ -452,6 +479,8 @@ def local_channels() -> list[str]:
 
 
 def _answer(answer: concurrent.futures.Future[T], function: Callable[..., T], args: tuple[Any, ...]) -> None:
+    if not answer.set_running_or_notify_cancel():
+        return
     try:
         answer.set_result(function(*args))
     except BaseException as error:  # noqa: BLE001 - raised where it was asked for

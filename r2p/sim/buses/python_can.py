@@ -101,27 +101,27 @@ class R2pSimBus(can.BusABC):
             raise TypeError(f"the interface r2psim has no option {', '.join(unknown)}; it has {known}")
         if fd:
             raise can.CanInitializationError("simulated buses are CAN 2.0, without CAN FD: open it without fd=True")
-        if not channel or channel != str(channel).strip():
+        self.channel = str(channel)
+        if not isinstance(channel, str | int) or not self.channel or self.channel != self.channel.strip():
             raise ValueError(f'a channel is the name of a bus, such as "lab", not {channel!r}')
         options = AttachmentOptions(
             bitrate=None if bitrate is None else int(bitrate),
             noise=float(noise),
-            seed=seed,
-            name=name,
-            one_shot=one_shot,
+            seed=None if seed is None else int(seed),
+            name=str(name),
+            one_shot=bool(one_shot),
             offset=round(float(offset) * SECOND),
             drift_ppm=float(drift),
             loss=float(loss),
-            recovery=recovery,
-            listen_only=listen_only,
-            own=receive_own_messages,
+            recovery=bool(recovery),
+            listen_only=bool(listen_only),
+            own=bool(receive_own_messages),
             states=not ignore_rx_error_frames,
-            errors=berr_reporting and not ignore_rx_error_frames,
+            errors=bool(berr_reporting and not ignore_rx_error_frames),
             filters=filters_of(can_filters),
             rx_queue=int(rx_queue_size),
             served=served,
         )
-        self.channel = str(channel)
         try:
             self._attachment: BusAttachment = attach(self.channel, options)
         except TransportError as error:

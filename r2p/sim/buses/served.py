@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from r2p.clock import SystemClock
+from r2p.codecs.can_bits import check_frame
 from r2p.errors import Closed, DecodeError, Error, TransportError
 from r2p.log_lines import get_logger
 from r2p.sim.buses import rendezvous, wire
-from r2p.sim.buses.attachment import TX_QUEUE, BusAttachment, BusFrame
+from r2p.sim.buses.attachment import TX_QUEUE, BusAttachment, BusFrame, check_filters, deadline_of
 from r2p.sim.can import ControllerState
 from r2p.units import SECOND
 
@@ -164,6 +165,7 @@ class ServedAttachment(BusAttachment):
     # Sending
 
     def send(self, frame: Frame | OtherFrame, timeout: float | None = None) -> None:
+        check_frame(frame)  # the server would end the connection
         message = wire.encode_message(wire.MessageType.SEND, wire.encode_frames([frame]))
         with self._lock:
             self._check()
@@ -184,7 +186,7 @@ class ServedAttachment(BusAttachment):
 
     def _wait_for_room(self, timeout: float | None) -> None:
         """Wait until the queue has room; called with the lock. Raises TimeoutError."""
-        deadline = _deadline(timeout)
+        deadline = deadline_of(timeout)
         goes_on = True
         while goes_on and self._waiting() >= TX_QUEUE:
             done = self._status.done
@@ -202,7 +204,7 @@ class ServedAttachment(BusAttachment):
         self._order(wire.MessageType.RESTART)
 
     def set_filters(self, filters: Sequence[BusFilter]) -> None:
-        self._order(wire.MessageType.FILTERS, wire.encode_filters(filters))
+        self._order(wire.MessageType.FILTERS, wire.encode_filters(check_filters(filters)))
 
     def _order(self, kind: wire.MessageType, body: bytes = b"") -> None:
         with self._lock:
@@ -225,7 +227,7 @@ class ServedAttachment(BusAttachment):
                 return wire.decode_event(self._events.popleft())
             except IndexError:  # another thread was faster
                 pass
-        deadline = _deadline(timeout)
+        deadline = deadline_of(timeout)
         with self._lock:
             while not self._events:
                 self._check()
@@ -363,10 +365,6 @@ def _after_fork() -> None:
 
 
 os.register_at_fork(after_in_child=_after_fork)
-
-
-def _deadline(timeout: float | None) -> int | None:
-    return None if timeout is None else _clock.monotonic() + round(timeout * SECOND)
 
 
 def _wait(condition: threading.Condition, deadline: int | None) -> bool:

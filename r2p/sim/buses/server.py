@@ -46,7 +46,7 @@ _HOST: Final = "127.0.0.1"
 _BACKLOG: Final = 1024  # connections that the kernel keeps until the loop has time: beyond, clients wait a second
 _STRANGERS_MAX: Final = 64  # connections that have not sent the secret yet
 _GREETING_TIMEOUT: Final = 5.0  # seconds
-_MESSAGE_MAX: Final = 4096  # bytes of a message of a client: more than TX_QUEUE frames
+_MESSAGE_MAX: Final = 1 << 13  # bytes of a message of a client: more than TX_QUEUE frames, or FILTERS_MAX filters
 _BUFFER_MAX: Final = 1 << 16  # bytes of events that wait in a connection before they wait here
 _computer: Final = SystemClock()
 

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 VERSION: Final = 1
 PROOF_SIZE: Final = 16
 """Bytes of the secret that each side sends."""
-GREETING_MAX: Final = 4096
-"""Bytes after the head of a greeting, at most."""
+GREETING_MAX: Final = 1 << 15
+"""Bytes after the head of a greeting, at most: more than the JSON of `FILTERS_MAX` filters."""
 BODY_MAX: Final = 1 << 19
 """Bytes of a message after its head, at most: some 15 000 events."""
 
@@ -186,10 +186,9 @@ def encode_status(status: Status) -> bytes:
 def encode_event(event: BusFrame) -> bytes:
     """Return one record of EVENTS."""
     identifier, length, data = (0, 0, b"") if event.frame is None else parts(event.frame)
+    tx_errors, rx_errors = min(event.tx_errors, _COUNTER_MAX), min(event.rx_errors, _COUNTER_MAX)
     kind = event.own | _ERROR_NUMBERS[event.error] | _STATE_NUMBERS[event.state]
-    return _EVENT.pack(
-        identifier, length, kind, event.place, data, event.end, event.utc, event.tx_errors, event.rx_errors
-    )
+    return _EVENT.pack(identifier, length, kind, event.place, data, event.end, event.utc, tx_errors, rx_errors)
 
 
 def decode_status(body: bytes) -> Status:

@@ -241,6 +241,10 @@ def test_filters(pair: tuple[can.BusABC, can.BusABC]) -> None:
         ({"bitrate": 300_000}, ValueError, "at 300000 bit/s a bit does not take whole nanoseconds"),
         ({"noise": 2}, ValueError, "noise is a share"),
         ({"can_filters": [{"can_id": 1}]}, ValueError, 'a filter is a dict with "can_id" and "can_mask", not'),
+        ({"can_filters": [{"can_id": -1, "can_mask": 0}]}, ValueError, "at most 32 bits, not -1"),
+        ({"drift": float("nan")}, ValueError, "a clock drifts by less than 1000000 ppm, not nan"),
+        ({"channel": ""}, ValueError, """such as "lab", not ''"""),
+        ({"channel": b"lab"}, ValueError, """such as "lab", not b'lab'"""),
         ({"channel": " lab"}, ValueError, """a channel is the name of a bus, such as "lab", not ' lab'"""),
     ],
 )
@@ -248,6 +252,15 @@ def test_wrong_options_are_said(options: dict[str, Any], error: type[Exception],
     with pytest.raises(error, match=words):
         can.Bus(**{"interface": "r2psim", "channel": "x", "served": False, **options})
     assert "x" not in [name for name, _ in running_buses()]
+
+
+def test_the_number_of_a_channel_is_its_name() -> None:
+    with (
+        can.Bus(interface="r2psim", channel=0, served=False) as a,
+        can.Bus(interface="r2psim", channel="0", served=False) as b,
+    ):
+        a.send(message(1))
+        assert b.recv(SOON)
 
 
 def test_another_bit_rate_is_refused(pair: tuple[can.BusABC, can.BusABC], channel: str) -> None:
@@ -339,7 +352,7 @@ def test_python_can_first_and_modules_after_it(channel: str) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-def test_a_fork_has_no_bus(pair: tuple[can.BusABC, can.BusABC]) -> None:
+def test_a_fork_has_no_bus_but_opens_others(pair: tuple[can.BusABC, can.BusABC], channel: str) -> None:
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -347,11 +360,17 @@ def test_a_fork_has_no_bus(pair: tuple[can.BusABC, can.BusABC]) -> None:
             pair[0].recv(0)
         except can.CanOperationError as error:
             os.write(writer, str(error).encode())
+            with (
+                can.Bus(interface="r2psim", channel=channel, served=False) as a,
+                can.Bus(interface="r2psim", channel=channel, served=False) as b,
+            ):
+                a.send(message(0x123))
+                os.write(writer, b"; %x" % getattr(b.recv(SOON), "arbitration_id", 0))
         finally:
             os._exit(0)
     os.close(writer)
     with os.fdopen(reader) as pipe:
-        assert pipe.read().endswith("forked from the one that opened the bus: open buses after the fork")
+        assert pipe.read().endswith("forked from the one that opened the bus: open buses after the fork; 123")
     os.waitpid(child, 0)
     pair[0].send(message(1))
     assert pair[1].recv(SOON)

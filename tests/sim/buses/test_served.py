@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from r2p.codecs.can_bits import INTERMISSION, Frame, frame_bits
-from r2p.errors import Closed, Error, TransportError
+from r2p.codecs.can_bits import INTERMISSION, Frame, OtherFrame, frame_bits
+from r2p.errors import Closed, Error, MessageError, TransportError
 from r2p.sim.buses import attach, channels, rendezvous, wire
 from r2p.sim.buses import served as client_module
-from r2p.sim.buses.attachment import TX_QUEUE, AttachmentOptions, BusFilter
+from r2p.sim.buses.attachment import FILTERS_MAX, TX_QUEUE, AttachmentOptions, BusFilter
 from r2p.sim.buses.served import ServedAttachment, connect
 from r2p.sim.buses.server import serve_bus
 from r2p.sim.can import ControllerState
@@ -186,6 +186,31 @@ def test_close_wakes_calls_that_wait_and_all_others_raise() -> None:
             with pytest.raises(Closed, match="the attachment to lab was closed"):
                 call()
         a.close()
+
+
+@pytest.mark.usefixtures("bus")
+def test_frames_that_can_does_not_have_are_refused_and_the_attachment_goes_on() -> None:
+    with attached() as a, attached() as b:
+        for wrong in (Frame(1 << 29, b""), Frame(-1, b""), OtherFrame(0x800), OtherFrame(1, remote=16)):
+            with pytest.raises(MessageError, match="does not fit a frame"):
+                a.send(wrong)
+        a.send(Frame(1, b""))
+        assert frames_of(b, 1) == [Frame(1, b"")]
+
+
+def test_as_many_filters_as_linux_allows() -> None:
+    filters = tuple(BusFilter(0xFFFF_FFFF - number, 0xFFFF_FFFF, extended=False) for number in range(FILTERS_MAX))
+    with served(), attached() as a, attached(filters=filters) as b:
+        a.send(Frame(1, b""))
+        b.set_filters(filters[1:])
+        b.set_filters(filters)
+        b.set_filters(())
+        b.send(Frame(0, b""))  # after the filters, on one connection
+        assert frames_of(a, 1) == [Frame(0, b"")]
+        a.send(Frame(2, b""))
+        assert frames_of(b, 1) == [Frame(2, b"")]
+        with pytest.raises(MessageError, match="513 filters, of 512 at most"):
+            b.set_filters([*filters, BusFilter(0, 0)])
 
 
 def test_a_node_leaves_the_bus_with_its_program(bus: ServedInThread) -> None:

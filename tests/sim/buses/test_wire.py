@@ -71,6 +71,13 @@ def test_filters(extended: bool | None) -> None:
     assert wire.decode_filters(wire.encode_filters(filters)) == filters
 
 
+def test_error_counters_of_more_than_16_bits_are_the_highest() -> None:
+    event = BusFrame(None, 0, 0, error=ErrorKind.BIT, tx_errors=1 << 16, rx_errors=1 << 40)
+    body = wire.encode_status(wire.Status(0, 0, ControllerState.ACTIVE, 0, 0)) + wire.encode_event(event)
+    decoded = wire.decode_event(next(wire.event_records(body)))
+    assert (decoded.tx_errors, decoded.rx_errors) == (0xFFFF, 0xFFFF)
+
+
 def test_greetings() -> None:
     proof = bytes(range(wire.PROOF_SIZE))
     greeting = wire.encode_greeting(proof, b"hello")
