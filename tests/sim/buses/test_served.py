@@ -200,8 +200,9 @@ def test_frames_that_can_does_not_have_are_refused_and_the_attachment_goes_on() 
 
 def test_as_many_filters_as_linux_allows() -> None:
     filters = tuple(BusFilter(0xFFFF_FFFF - number, 0xFFFF_FFFF, extended=False) for number in range(FILTERS_MAX))
-    with served(), attached() as a, attached(filters=filters) as b:
+    with served(), attached(own=True) as a, attached(filters=filters) as b:
         a.send(Frame(1, b""))
+        assert frames_of(a, 1) == [Frame(1, b"")]  # sent, and filtered
         b.set_filters(filters[1:])
         b.set_filters(filters)
         b.set_filters(())
