@@ -208,7 +208,11 @@ class BusAttachment(ABC):
 
     @abstractmethod
     def fileno(self) -> int:
-        """Return a descriptor that is readable while `receive(0)` has an event; it is closed by `close`."""
+        """Return a descriptor that is readable while `receive(0)` has an event or raises an error.
+
+        After `close` it is never readable. It exists as long as the attachment does: an event loop that still watches
+        it must not find another file of the same number.
+        """
 
     @abstractmethod
     def close(self) -> None:

@@ -195,7 +195,7 @@ class LocalAttachment(BusAttachment):
         self._ended = _FORKED
         self._room = threading.Condition()
         self._events = queue.SimpleQueue()
-        self._release = None
+        self._release = self._ready = None  # that would read from the other process's descriptor
 
     def _check(self) -> None:
         if self._ended is not None:
@@ -374,10 +374,16 @@ class _Readiness:
                     self._set = False
 
     def close(self) -> None:
+        """Make it unreadable for good."""
         with self._lock:
             self._closed = True
-            self._reader.close()
-            self._writer.close()
+            if self._set:
+                self._reader.recv(1)
+                self._set = False
+
+    def __del__(self) -> None:
+        self._reader.close()
+        self._writer.close()
 
 
 class BusThread:

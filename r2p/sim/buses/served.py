@@ -258,8 +258,8 @@ class ServedAttachment(BusAttachment):
             return self._signal
 
     def _show(self) -> None:
-        """Let `fileno` be readable if there is something for `receive`: an event, or the end."""
-        wanted = bool(self._events) or self._end is not None
+        """Let `fileno` be readable if there is something for `receive`: an event, or the end of the server."""
+        wanted = bool(self._events) or self._end not in (None, self._closed)
         if self._signal is None or wanted == self._signalled:
             return
         self._signalled = wanted
@@ -274,11 +274,12 @@ class ServedAttachment(BusAttachment):
         with self._lock:
             self._events.clear()
             self._finish(self._closed)
-            signal, self._signal = self._signal, None
-        if signal is not None:
-            os.close(signal)
         if threading.current_thread() is not self._thread:
             self._thread.join(_CLOSE_TIMEOUT)
+
+    def __del__(self) -> None:
+        if self._signal is not None:
+            os.close(self._signal)
 
     def _closed(self) -> Error:
         return Closed(f"the attachment to {self._name} was closed")
@@ -295,7 +296,11 @@ class ServedAttachment(BusAttachment):
         self._changed, self._arrived = threading.Condition(self._lock), threading.Condition(self._lock)
         self._end = self._forked
         self._events.clear()
-        os.close(self._connection.detach())  # without an end for the other process
+        if (descriptor := self._connection.detach()) >= 0:  # the connection has not ended
+            os.close(descriptor)  # without an end for the other process
+        if self._signal is not None:
+            os.close(self._signal)
+            self._signal = None
 
     def _forked(self) -> Error:
         return TransportError(

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 VERSION: Final = 1
 PROOF_SIZE: Final = 16
 """Bytes of the secret that each side sends."""
-GREETING_MAX: Final = 1 << 15
+GREETING_MAX: Final = 32_768
 """Bytes after the head of a greeting, at most: more than the JSON of `FILTERS_MAX` filters."""
 BODY_MAX: Final = 1 << 19
 """Bytes of a message after its head, at most: some 15 000 events."""

@@ -165,8 +165,7 @@ def test_closing_leaves_nothing_behind(channel: str) -> None:
         gc.collect()
         return len(list(Path("/proc/self/fd").glob("*")))  # none where there is no /proc
 
-    before = descriptors()
-    for _ in range(20):
+    def use() -> None:
         with (
             can.Bus(interface="r2psim", channel=channel, served=False) as a,
             can.Bus(interface="r2psim", channel=channel, served=False) as b,
@@ -174,6 +173,10 @@ def test_closing_leaves_nothing_behind(channel: str) -> None:
             b.fileno()
             a.send(message(1))
             assert b.recv(SOON)
+
+    before = descriptors()
+    for _ in range(20):
+        use()
     assert descriptors() <= before
     assert f"r2psim {channel}" not in [each.name for each in threading.enumerate()]
     assert channel not in [name for name, _ in running_buses()]
@@ -288,6 +291,29 @@ def test_channels_are_found(pair: tuple[can.BusABC, can.BusABC], channel: str) -
     found = can.detect_available_configs("r2psim")
     assert {"interface": "r2psim", "channel": channel} in found
     assert {"interface": "r2psim", "channel": "channel-0"} in found
+
+
+async def shut_down_under_a_notifier(channel: str, options: dict[str, Any]) -> None:
+    def open_bus() -> can.BusABC:
+        return can.Bus(interface="r2psim", channel=channel, **options)
+
+    loop = asyncio.get_running_loop()
+    first = open_bus()
+    notifier = can.Notifier(first, [print], loop=loop)
+    first.shutdown()  # before the notifier, which watches the descriptor
+    with open_bus() as sender, open_bus() as second:
+        received: asyncio.Queue[can.Message] = asyncio.Queue()
+        other = can.Notifier(second, [received.put_nowait], loop=loop)
+        for identifier in range(2):
+            sender.send(message(identifier))
+            assert (await asyncio.wait_for(received.get(), SOON)).arbitration_id == identifier
+            notifier.stop()  # the first time: of another descriptor than that of `second`
+        other.stop()
+
+
+def test_a_bus_is_shut_down_before_its_notifier(channel: str) -> None:
+    asyncio.run(shut_down_under_a_notifier(channel, {"served": False}))
+    r2p.sim.run(shut_down_under_a_notifier(channel, {}))
 
 
 async def use_from_threads(channel: str) -> None:

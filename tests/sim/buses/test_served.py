@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import select
 import socket
 import threading
@@ -196,6 +197,22 @@ def test_frames_that_can_does_not_have_are_refused_and_the_attachment_goes_on() 
                 a.send(wrong)
         a.send(Frame(1, b""))
         assert frames_of(b, 1) == [Frame(1, b"")]
+
+
+@pytest.mark.usefixtures("bus")
+def test_a_descriptor_is_the_attachments_own_until_it_is_gone() -> None:
+    with attached(states=False) as a, attached() as b:
+        first = a.fileno()
+        a.close()
+        assert not select.select([first], [], [], 0)[0]
+        second = b.fileno()
+        child = os.fork()
+        if child == 0:
+            b.close()
+            os._exit(0)
+        os.waitpid(child, 0)
+        assert second != first
+        assert not select.select([second], [], [], 0)[0]  # the end of the copy is not that of the other one
 
 
 def test_as_many_filters_as_linux_allows() -> None:
