@@ -1,6 +1,6 @@
 """What a network costs tiltOne: tilt, torque and age of its motors' input, over RTCAN, zenoh and TCP, in virtual time.
 
-    python -m benchmarks.tiltone_study [--seeds 3] [--duration 3] [--loads 0 60 ...] [--jobs 1] [--figures DIRECTORY]
+    python -m benchmarks.tiltone_study [--seeds 3] [--duration 2] [--loads 0 60 ...] [--jobs 1] [--figures DIRECTORY]
 
 The output is Markdown: what docs/robots/tiltone-study.md shows is a run of this with its defaults, and each run prints
 the same. `benchmarks.tiltone.delays` recorded the delays of zenoh and TCP.
@@ -20,7 +20,7 @@ from benchmarks.tiltone import delays
 from benchmarks.tiltone.runs import PLANTS, Outcome, Scenario, one
 from r2p.sim.robots.triskar2 import Traffic
 
-LOADS = (0, 60, 80, 90, 95)
+LOADS = (0, 60, 90, 95)
 """Percent of the slots that nobody reserved."""
 CONSTANT = (0, 10, 15, 20, 40, 60, 80)
 """Delays of all messages, ms."""
@@ -175,7 +175,7 @@ def draw_tilts(results: dict[str, list[Row]], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="What a network costs a robot that balances, in virtual time")
     parser.add_argument("--seeds", type=int, default=3, help="how many runs of each scenario")
-    parser.add_argument("--duration", type=float, default=3.0, help="measured seconds of each run")
+    parser.add_argument("--duration", type=float, default=2.0, help="measured seconds of each run")
     parser.add_argument("--loads", type=int, nargs="+", default=LOADS, help="in percent of the unreserved slots")
     parser.add_argument("--jobs", type=int, default=1, help="runs at the same time")
     parser.add_argument("--figures", type=Path, help="a directory to write the figures to")

@@ -82,7 +82,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True):
     seed: int = 1
     settled: float = 1.0
     """Seconds until the measurement starts, from when the network is as bad as it gets."""
-    duration: float = 3.0
+    duration: float = 2.0
     """Seconds that are measured."""
 
     @property
