@@ -18,7 +18,7 @@ import msgspec
 from benchmarks.thesis.svg import COLOURS, Plot
 from benchmarks.tiltone import delays
 from benchmarks.tiltone.runs import PLANTS, Outcome, Scenario, one
-from r2p.sim.robots.triskar2 import Traffic
+from r2p.sim.robots.shared_nodes import Traffic
 
 LOADS = (0, 60, 90, 95)
 """Percent of the slots that nobody reserved."""

@@ -21,9 +21,9 @@ from r2p.clock import clock_of
 from r2p.codecs import rtcan
 from r2p.msg import IMU, Encoder, Proximity, Velocity3
 from r2p.protocols.rtcan.cycle import timing
+from r2p.sim.robots.shared_nodes import Traffic
 from r2p.sim.robots.tiltone import nodes
 from r2p.sim.robots.tiltone.robot import ControlInput, TiltOne
-from r2p.sim.robots.triskar2 import Traffic
 from r2p.transports.memory import network
 
 PLANTS = {"geared": nodes.GEARED, "torque": nodes.TORQUE, "NXTway": nodes.LEGO}
