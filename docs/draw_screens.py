@@ -35,6 +35,7 @@ from r2p.tools import doctor
 from r2p.tools.main import app
 from r2p.tools.session import Settings, join
 from r2p.tools.sim import run
+from r2p.tools.sim.hexapod import HexapodDisplay
 from r2p.tools.sim.robocom import RobocomDisplay
 from r2p.tools.sim.run import simulate
 from r2p.tools.sim.screen import SimulatorScreen
@@ -52,6 +53,9 @@ MOMENT = 11.25
 """Seconds of the demo, in the picture."""
 SHOVED = 12.25
 """Seconds of `r2p sim tiltone`, in the picture: just after the shove."""
+
+WALKING = 2.0
+"""Seconds of `r2p sim hexapod`, in the picture."""
 
 _OUTSIDE = "memory:lab"  # where the emulated robot is looked at; the picture shows an address as users have it
 _ADDRESS = "tcp:127.0.0.1:45123"
@@ -162,7 +166,7 @@ def _chunk(classes: str, column: int, row: int, text: str) -> str:
 
 def pictures() -> dict[str, str]:
     """Return all pictures by their file names."""
-    screens = _beside_the_robot() | _balancing() | _fusing() | {"doctor": _doctor()}
+    screens = _beside_the_robot() | _balancing() | _fusing() | _walking() | {"doctor": _doctor()}
     screens["admit"], slots = _admit()
     return {f"{name}.svg": draw(screen) for name, screen in screens.items()} | {"slots.svg": slots}
 
@@ -232,6 +236,30 @@ async def _tiltone() -> dict[str, Screen]:
     seen = asyncio.Event()
     with patch.object(SimulatorScreen, "show", show):
         robot = asyncio.create_task(simulate(TiltOneDisplay, outside=[_OUTSIDE], rounds=1))
+        await seen.wait()
+        robot.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await robot
+    return screens
+
+
+def _walking() -> dict[str, Screen]:
+    with _terminal(), patch.object(run, "addresses", lambda _robot: [_ADDRESS]):
+        return sim.run(_hexapod, seed=1)
+
+
+async def _hexapod() -> dict[str, Screen]:
+    """The robot of 20 modules, while three of its legs swing."""
+    screens: dict[str, Screen] = {}
+
+    def show(screen: SimulatorScreen, figures: RobotFigures) -> None:
+        if not screens and figures.time >= WALKING - 0.01:
+            screens["hexapod"] = _frame(screen, figures, COLUMNS, 24, "r2p sim hexapod --drive")
+            seen.set()
+
+    seen = asyncio.Event()
+    with patch.object(SimulatorScreen, "show", show):
+        robot = asyncio.create_task(simulate(HexapodDisplay, outside=[_OUTSIDE], rounds=1))
         await seen.wait()
         robot.cancel()
         with contextlib.suppress(asyncio.CancelledError):

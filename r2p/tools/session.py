@@ -148,12 +148,15 @@ async def wait_until(condition: Callable[[], bool], timeout: float) -> bool:
     return True
 
 
+_INSTANT = 1e-9  # s: two instants of a clock differ by at least so much, their difference is off by less
+
+
 async def moments(duration: float | None, period: float) -> AsyncIterator[float]:
     """Yield the seconds since the start, once each period and at the end; without `duration` there is none."""
     loop = asyncio.get_running_loop()
     start = loop.time()
     time = 0.0
-    while duration is None or time < duration:
+    while duration is None or duration - time > _INSTANT:
         await asyncio.sleep(period if duration is None else min(period, duration - time))
         time = loop.time() - start
         yield time

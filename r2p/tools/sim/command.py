@@ -22,14 +22,15 @@ if TYPE_CHECKING:
 
 _FAST = 60.0  # seconds
 
-_Name = Literal["triskar2", "robocom", "tiltone"]
+_Name = Literal["triskar2", "robocom", "tiltone", "hexapod"]
 _DISPLAYS: dict[_Name, str] = {
     "triskar2": "Triskar2Display",
     "robocom": "RobocomDisplay",
     "tiltone": "TiltOneDisplay",
+    "hexapod": "HexapodDisplay",
 }
 """The display of each robot, in a module with its name."""
-_ROBOTS = "Of the thesis: triskar2, on omni wheels; robocom, for sensor fusion; tiltone, which balances."
+_ROBOTS = "Of the thesis: triskar2, on omni wheels; robocom, for fusion; tiltone, which balances. Also: hexapod."
 
 
 def _complete_extra(ctx: typer.Context, incomplete: str) -> list[str]:

@@ -180,7 +180,7 @@ async def walker(node: r2p.Node, speed: float = 0.1, turn: float = 0.3, rounds: 
     """Publish `velocity`: ahead, to the left, around, and a rest, `rounds` times. A node for a PC."""
     start = node.now()
     commands = node.advertise("velocity", Velocity3, r2p.Sporadic(deadline=COMMANDS))
-    parts = (Velocity3(), Velocity3(x=speed), Velocity3(x=speed, w=turn), Velocity3(y=speed), Velocity3(w=turn))
+    parts = (Velocity3(x=speed), Velocity3(x=speed, w=turn), Velocity3(y=speed), Velocity3(w=turn), Velocity3())
     async for _ in node.every(COMMANDS):
         number = int((node.now() - start) / 4e9)
         done = number >= rounds * len(parts)
