@@ -1,10 +1,12 @@
 """Where was the robot? An extended Kalman filter joins encoders, gyroscope and GPS of a recording of Robocom.
 
-All of them are stamped in the time of the robot's bus: sort by stamp, and go through. In two terminals:
+All of them are stamped in the time of the robot's bus: sort by stamp, and go through, from the first known pose on.
+In two terminals:
 r2p sim robocom --drive --via tcp-listen:2323
 r2p bag record -a -o drive.mcap --max-duration 60s --via tcp:127.0.0.1:2323; python fusion.py drive.mcap
 """
 
+import itertools
 import math
 import operator
 import sys
@@ -21,7 +23,7 @@ SLIP = 0.003  # of a way, m per root of m
 SPIN = 0.0075  # noise of a reading of the gyroscope, rad/s
 TURN = 0.015  # how far it and the turn of the wheels may differ, as one is an instant and the other an interval, rad/s
 FIX = 3.0  # m for each coordinate of a fix: its error is smaller, but five fixes a second have almost the same
-START = (0.01, 0.01, 0.003, 0.02, 0.01)  # sigmas: it starts at the origin and faces north; m, m, rad, rad/s, rad/m
+START = (0.01, 0.01, 0.003, 0.02, 0.01)  # sigmas: it is known where the robot starts; m, m, rad, rad/s, rad/m
 METRES = BODY.wheel_radius / MOTOR.ticks_per_radian  # of a tick
 X, Y = (1, 0, 0, 0, 0), (0, 1, 0, 0, 0)
 
@@ -29,8 +31,8 @@ X, Y = (1, 0, 0, 0, 0), (0, 1, 0, 0, 0)
 class Filter:
     """The state: x, y, heading, bias of the gyroscope, and how far wheels of unequal size seem to turn it per metre."""
 
-    def __init__(self) -> None:
-        self.s = [0.0] * 5
+    def __init__(self, start: StampedPose3) -> None:
+        self.s = [start.x, start.y, start.w, 0.0, 0.0]
         self.p = [[sigma**2 if row == column else 0.0 for column in range(5)] for row, sigma in enumerate(START)]
 
     def move(self, way: float, turned: float, rate: float, dt: float) -> None:
@@ -40,13 +42,8 @@ class Filter:
         cos, sin = math.cos(w + turn / 2), math.sin(w + turn / 2)
         self.s = [x + way * cos, y + way * sin, w + turn, bias, unequal]
         f = [[float(row == column) for column in range(5)] for row in range(5)]
-        f[0][2], f[0][3], f[1][2], f[1][3], f[2][3] = (
-            -way * sin,
-            way * sin * dt / 2,
-            way * cos,
-            -way * cos * dt / 2,
-            -dt,
-        )
+        f[0][2], f[1][2], f[2][3] = -way * sin, way * cos, -dt
+        f[0][3], f[1][3] = way * sin * dt / 2, -way * cos * dt / 2
         fp = [[dot(row, column) for column in self.p] for row in f]  # p is symmetric
         self.p = [[dot(row, other) for other in f] for row in fp]
         slip = SLIP**2 * abs(way)
@@ -84,13 +81,15 @@ def read(path: str) -> list[tuple[int, r2p.Message, str]]:
 
 def fuse(path: str) -> dict[str, float]:
     """Return the RMS error of each estimate of the position, m. Truth is what the simulation knows."""
-    fused, alone = Filter(), Filter()  # the second one never sees a fix
     ticks = {"encoder_left": 0.0, "encoder_right": 0.0}
-    x = y = w = rate = last = 0.0
-    before, seen, fix = 0, set(), (0.0, 0.0)
+    rate = last = 0.0
+    before, seen, fix, origin = 0, set(), (0.0, 0.0), GeoOrigin()
+    measured = list(itertools.dropwhile(lambda each: each[2] != "truth", read(path)))
+    start: Any = measured[0][1]
+    fused, alone = Filter(start), Filter(start)  # the second one never sees a fix
+    x, y, w = fused.s[:3]
     errors: dict[str, list[float]] = {"encoders": [], "encoders and gyroscope": [], "GPS": [], "all three": []}
-    origin = GeoOrigin()
-    for at, message, topic in read(path):
+    for at, message, topic in measured:
         if isinstance(message, StampedIMURaw9):
             rate = message.gyro_z * COUNT
         elif isinstance(message, StampedEncoder):

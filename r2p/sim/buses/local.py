@@ -451,7 +451,7 @@ def attach_here(channel: str, options: AttachmentOptions) -> LocalAttachment | N
         found = [shared for shared in found if shared.loop is loop]
         if not found:
             raise TransportError(f"several event loops of this program have a bus {channel}: give them other names")
-    return LocalAttachment(channel, found[0], options, "of an event loop of this process") if found else None
+    return LocalAttachment(channel, found[0], options, "a bus of an event loop of this process") if found else None
 
 
 def attach_to_thread(channel: str, options: AttachmentOptions) -> LocalAttachment:
@@ -473,7 +473,7 @@ def attach_to_thread(channel: str, options: AttachmentOptions) -> LocalAttachmen
             thread.stop()
 
     try:
-        return LocalAttachment(channel, thread.shared, options, "of this process", release)
+        return LocalAttachment(channel, thread.shared, options, "a bus of this process", release)
     except BaseException:
         release()
         raise

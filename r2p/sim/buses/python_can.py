@@ -105,7 +105,7 @@ class R2pSimBus(can.BusABC):
         if not isinstance(channel, str | int) or not self.channel or self.channel != self.channel.strip():
             raise ValueError(f'a channel is the name of a bus, such as "lab", not {channel!r}')
         options = AttachmentOptions(
-            bitrate=None if bitrate is None else int(bitrate),
+            bitrate=None if bitrate is None else _bitrate(bitrate),
             noise=float(noise),
             seed=None if seed is None else int(seed),
             name=str(name),
@@ -276,6 +276,14 @@ class LoopCyclicSendTask(LimitedDurationCyclicSendTaskABC, ModifiableCyclicTaskA
         self._count += 1
         self._timer = self._loop.call_at(self._started + self._count * self.period, self._tick)
         in_background(self._timer)
+
+
+def _bitrate(given: Any) -> int:
+    """Return a bit rate, which is a text where python-can has read it from its environment."""
+    try:
+        return int(given)
+    except (TypeError, ValueError):
+        raise ValueError(f"a bit rate is a number of bit/s, such as 500000, not {given!r}") from None
 
 
 @contextlib.contextmanager

@@ -86,7 +86,10 @@ class BusServer:
         if len(self.clients) >= CLIENTS_MAX:
             raise TransportError(f"{CLIENTS_MAX} programs use the bus {self.name}, and no more can: end one of them")
         if options.bitrate not in (None, self.can.bitrate):
-            raise TransportError(f"the bus {self.name} has {self.can.bitrate} bit/s, not {options.bitrate}")
+            raise TransportError(
+                f"the bus {self.name} has {self.can.bitrate} bit/s, not {options.bitrate}: "
+                f"open it with bitrate={self.can.bitrate}"
+            )
         if len(options.name) > _NAME_MAX:
             raise TransportError(f"the name of a node has {_NAME_MAX} characters at most")
         driver = BusDriver(self.can, options, client.on_event, client.on_change)

@@ -77,9 +77,10 @@ class SimulatorScreen(Generic[B]):
         if figures.bus is not None:
             self.print(f"bus: {figures.bus.frames} frames, {figures.bus.errors} errors; load {figures.bus.mean:.0%}")
         if figures.slow and not fast:
+            robot = self._display.robot_class.title.lower()
             self.print(
                 f"this PC was too slow for {figures.slow:.1f} of {figures.time:.1f} s: messages were late or skipped;",
-                f"  end other programs, or simulate in virtual time: {program()} sim --fast",
+                f"  end other programs, or let simulated time wait: {program()} sim {robot} --speed 1",
             )
 
     def draw(self, figures: RobotFigures[B]) -> RenderableType:

@@ -27,6 +27,7 @@ _SPEED, _TURN = 0.5, 0.6  # m/s and rad/s
 _SHOVE = -10.0  # Ns, from ahead
 _LYING = 3.0  # s that it lies on the floor before it is set upright
 _SHOWN = 1.0  # s for which a shove is in the picture
+_UPRIGHT = math.radians(10)  # up to this tilt a robot whose motors stopped is not called falling
 _LOOK = 0.1  # s between two looks at whether it fell
 
 _MAGNIFIED = 4  # times that it leans as far in the picture
@@ -160,7 +161,9 @@ class TiltOneDisplay(RobotDisplay[TiltOneFigures]):
             return "held"
         if body.fallen:
             return "fallen"
-        return "balancing" if all(drive.setpoint for drive in drives) else "falling"
+        if all(drive.setpoint for drive in drives):
+            return "balancing"
+        return "falling" if abs(body.tilt) > _UPRIGHT else "stopped"  # by a brake, as when an effort was late
 
     def _time(self) -> float:
         plant = self.robot.plant
@@ -188,7 +191,8 @@ class TiltOneDisplay(RobotDisplay[TiltOneFigures]):
                 self._falls += 1
                 await asyncio.sleep(_LYING)
                 await self.robot.set_upright()
-            self._worst = max(self._worst, abs(body.tilt))
+            if self._status() == "balancing":
+                self._worst = max(self._worst, abs(body.tilt))
 
     async def _demonstrate(self, node: r2p.Node, rounds: float) -> None:
         """Stand, drive, turn, get a shove from ahead, drive on, and stop."""

@@ -88,7 +88,7 @@ def test_stamps_are_utc_and_rise(pair: tuple[can.BusABC, can.BusABC]) -> None:
 
 
 def test_the_description_says_where_the_bus_is(pair: tuple[can.BusABC, can.BusABC], channel: str) -> None:
-    assert str(pair[0]) == f"r2psim {channel}: of this process, 1000000 bit/s"
+    assert str(pair[0]) == f"r2psim {channel}: a bus of this process, 1000000 bit/s"
     assert pair[0].protocol is can.CanProtocol.CAN_20
 
 
@@ -243,6 +243,7 @@ def test_filters(pair: tuple[can.BusABC, can.BusABC]) -> None:
         ({"fd": True}, can.CanInitializationError, "CAN 2.0, without CAN FD: open it without fd=True"),
         ({"bitrate": 300_000}, ValueError, "at 300000 bit/s a bit does not take whole nanoseconds"),
         ({"noise": 2}, ValueError, "noise is a share"),
+        ({"bitrate": "500k"}, ValueError, "a bit rate is a number of bit/s, such as 500000, not '500k'"),
         ({"can_filters": [{"can_id": 1}]}, ValueError, 'a filter is a dict with "can_id" and "can_mask", not'),
         ({"can_filters": [{"can_id": -1, "can_mask": 0}]}, ValueError, "at most 32 bits, not -1"),
         ({"drift": float("nan")}, ValueError, "a clock drifts by less than 1000000 ppm, not nan"),

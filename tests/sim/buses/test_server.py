@@ -135,7 +135,7 @@ async def test_a_client_learns_its_bus() -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"bitrate": 125_000}, "the bus lab has 1000000 bit/s, not 125000"),
+        ({"bitrate": 125_000}, "the bus lab has 1000000 bit/s, not 125000: open it with bitrate=1000000"),
         ({"name": "x" * 65}, "the name of a node has 64 characters at most"),
     ],
 )

@@ -39,6 +39,19 @@ async def test_joined_estimates_are_better_than_each_alone(tmp_path: Path) -> No
     assert 0.5 < error["GPS"] < 1.5
 
 
+async def test_a_recording_of_a_robot_that_drives_already_begins_at_its_pose(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    async with Robocom(VIA, seed=2, truth=True) as robot, r2p.Module("PC1", via=VIA) as pc:
+        await robot.ready(10)
+        pc.start(eight)
+        await asyncio.sleep(10)
+        async with r2p.Recorder(pc, tmp_path / "drive.mcap"):
+            await asyncio.sleep(5)
+    fuse: Callable[[str], dict[str, float]] = runpy.run_path(str(FUSION))["fuse"]
+    error = fuse(str(tmp_path / "drive.mcap"))
+    assert error["all three"] < 0.2 < error["GPS"]
+
+
 async def test_the_bus_itself_does_not_misalign_samples() -> None:
     """Without a delay of the modules' software, the end of the sync is one instant, and stamps are exact."""
     left, imu, stamp, ticks, arrival = await alignment(InterruptLatency(0.0, 0.0), seconds=2.0)

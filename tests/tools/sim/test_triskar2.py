@@ -138,7 +138,7 @@ def test_a_slow_computer_is_named_as_the_reason(capsys: pytest.CaptureFixture[st
     text = capsys.readouterr().out
     assert "PC too slow: 62% late\n" in text
     assert "this PC was too slow for 2.5 of 3.5 s: messages were late or skipped;" in text
-    assert text.endswith("sim --fast\n")
+    assert text.endswith("sim triskar2 --speed 1\n")
     assert max(map(len, text.splitlines())) <= 80
 
 
