@@ -74,6 +74,12 @@ class ImuCalibration(msgspec.Struct, frozen=True):
     sigma: float
     """Of one mean in one position, one sigma, mg, from the residuals; 18 equations - 12 unknowns leave 6."""
 
+    def correct(self, acc: Vector) -> Vector:
+        """Return a corrected reading of the accelerometer, mg."""
+        x, y, z = (value - offset for value, offset in zip(acc, self.acc_offset, strict=True))
+        m = self.acc_scale
+        return m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z, m[6] * x + m[7] * y + m[8] * z
+
     @property
     def offset_error(self) -> float:
         """Of `acc_offset`, one sigma, mg."""

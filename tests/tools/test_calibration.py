@@ -26,7 +26,7 @@ from r2p.tools.calibration import (
     solve,
     still,
 )
-from r2p.tools.imu import guided, parameters
+from r2p.tools.imu import ImuRanges, guided, parameters
 from r2p.tools.main import app
 from tests.sim.robots.rig import WAIT
 
@@ -139,7 +139,7 @@ async def test_it_finds_the_errors_of_an_emulated_imu(seed: int) -> None:
             await pc.network.set_parameters("IMU1", {("cube", "up"): side})
             robot.plant.step(10)  # the sensors have a sample of it
 
-        positions = await guided(node, "imu_raw", 2.0, turn)
+        positions = await guided(node, "imu_raw", 2.0, turn, ImuRanges())
         result = calibrate(positions)
         sensor = robot.hardware.inertial.accelerometer
         assert sensor.distortion is not None
@@ -171,7 +171,8 @@ def test_the_command_calibrates_from_a_file(tmp_path: Path) -> None:
     write(tmp_path / "cube.csv", SIDES)
     result = CliRunner().invoke(app, ["imu", "calibrate", "--from", str(tmp_path / "cube.csv")])
     assert result.exit_code == 0, result.output
-    offsets = [float(each) for each in result.output.splitlines()[0].split()[1:4]]
+    assert "acc_range is unknown, 2g assumed (no module to ask): give --acc-range" in result.stderr
+    offsets = [float(each) for each in result.stdout.splitlines()[0].split()[1:4]]
     assert offsets == pytest.approx(OFFSET, abs=4 * math.hypot(3.0, 0.3) / math.sqrt(80 * 6))
     assert "gyro_offset      87.5   -175.0    262.5  mdps" in result.output
     assert result.output.count("|") == 18, "a bar for each equation"
