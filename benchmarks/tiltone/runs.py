@@ -80,8 +80,8 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True):
     delay: float = 0.0
     """Of a memory network, s."""
     seed: int = 1
-    settled: float = 1.0
-    """Seconds until the measurement starts, from when the network is as bad as it gets."""
+    after: float = 5.0
+    """Seconds from when the robot is let go until the measurement starts: the same for all, as it still settles."""
     duration: float = 2.0
     """Seconds that are measured."""
 
@@ -158,9 +158,11 @@ async def _measured(scenario: Scenario) -> Outcome:
     async with robot:
         await robot.ready()
         await robot.release()
+        loop = asyncio.get_running_loop()
+        start = loop.time() + scenario.after
         await asyncio.sleep(STANDS)
         async with _disturbed(scenario):
-            await asyncio.sleep(scenario.settled)
+            await asyncio.sleep(start - loop.time())
             observers[0].reset()
             if bus is not None:
                 bus.bus.reset_statistics()
