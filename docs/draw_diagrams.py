@@ -1,9 +1,9 @@
-"""Draws `assets/diagrams/`: a message's way through the files, the tree of gateways, and drives of two robots.
+"""Draws `assets/diagrams/`: a message's way through the files, the tree of gateways, drives of two robots, and a cube.
 
 Run it from the root of the project when a walk in `architecture.md`, the gateways' protocol or that robot changes:
 `python docs/draw_diagrams.py`. The way is drawn from the tables in `architecture.md`, which tests compare with the
-code. The tree is that of real gateways under virtual time, the drives are those of emulated robots. A test
-compares pictures and code.
+code. The tree is that of real gateways under virtual time, the drives are those of emulated robots, and so is
+the sensor on the cube. A test compares pictures and code.
 """
 
 import asyncio
@@ -17,6 +17,10 @@ from xml.sax.saxutils import escape
 
 import r2p
 from r2p import sim
+from r2p.sim.robots.emulated import Triskar2
+from r2p.tools import imu_svg
+from r2p.tools.calibration import calibrate
+from r2p.tools.imu import ImuRanges, guided
 from r2p.tools.sim.robocom import RobocomDisplay, RobocomFigures
 from r2p.tools.sim.tiltone import TiltOneDisplay, TiltOneFigures
 
@@ -55,7 +59,13 @@ _STYLE = """
 
 def pictures() -> dict[str, str]:
     """Return all pictures by their file names."""
-    return {"message.svg": message(), "gateways.svg": gateways(), "tiltone.svg": balance(), "robocom.svg": eight()}
+    return {
+        "message.svg": message(),
+        "gateways.svg": gateways(),
+        "tiltone.svg": balance(),
+        "robocom.svg": eight(),
+        "imu.svg": cube(),
+    }
 
 
 def _svg(width: float, height: float, title: str, parts: Iterator[str]) -> str:
@@ -361,6 +371,32 @@ def _drawn_way(figures: list[RobocomFigures]) -> Iterator[str]:
     yield _text("note", 302, 688, "GPS, once a second")
     yield f'<path class="axis" d="M560 684 h{_SCALE}"/>'
     yield _text("note", 560 + _SCALE + 8, 688, "1 m")
+
+
+# An IMU on a cube
+
+
+def cube() -> str:
+    """Return what `r2p imu calibrate --plot` draws of an emulated sensor."""
+    return sim.run(_calibrate, seed=1)
+
+
+async def _calibrate() -> str:
+    via = "memory:cube"
+    async with Triskar2(via, seed=1, modules=["IMU1"]) as robot, r2p.Module("PC1", via=via, watchdog=False) as pc:
+        node = pc.start(_idle)
+        await asyncio.sleep(_AGREED)
+
+        async def turn(text: str) -> None:
+            await pc.network.set_parameters("IMU1", {("cube", "up"): text.split()[3]})
+            robot.plant.step(10)  # the sensors have a sample of it
+
+        positions = await guided(node, "imu_raw", 2.0, turn, ImuRanges())
+        return imu_svg.draw(positions, calibrate(positions))
+
+
+async def _idle(_node: r2p.Node) -> None:
+    await asyncio.Event().wait()
 
 
 if __name__ == "__main__":

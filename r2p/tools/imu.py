@@ -13,6 +13,7 @@ import typer
 import r2p
 from r2p.msg import IMURaw9
 from r2p.sim.physics.inertial import AccelerometerRange, GyroscopeRange
+from r2p.tools import imu_svg
 from r2p.tools.calibration import SIDES, CubePosition, ImuCalibration, ImuReading, positions_in, still
 from r2p.tools.calibration import calibrate as fit
 from r2p.tools.completion import complete_topic
@@ -69,6 +70,9 @@ async def calibrate(
     write: Annotated[
         str | None, typer.Option(metavar="MODULE", help="Set the parameters of this module's node sensors.")
     ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.svg", help="Draw the readings before and after, and what is left.")
+    ] = None,
     acc_range: Annotated[
         Literal["2g", "4g", "8g", "16g"] | None,
         typer.Option(help="Range of the accelerometer; default: what the module says."),
@@ -97,6 +101,8 @@ async def calibrate(
         raise r2p.Error(str(error)) from error
     for line in report(result):
         typer.echo(line)
+    if plot is not None:
+        _save(plot, imu_svg.draw(positions, result))
     if write is not None:
         await session.module.network.set_parameters(write, parameters(result))
         notify(f"{write}: 3 parameters of {_NODE} set; r2p param save {write} keeps them")
@@ -206,6 +212,13 @@ def _read(path: Path) -> list[list[int]]:
             f"{path} has no columns {_COLUMNS[0]} to {_COLUMNS[-1]} with counts: make it with "
             "r2p topic echo imu_raw --format csv"
         ) from error
+
+
+def _save(path: Path, picture: str) -> None:
+    try:
+        path.write_text(picture, encoding="utf-8")
+    except OSError as error:
+        raise r2p.Error(f"{path}: {error.strerror}") from error
 
 
 def parameters(result: ImuCalibration) -> dict[tuple[str, str], object]:

@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,7 +19,8 @@ from r2p.msg import IMURaw9
 from r2p.sim.physics.inertial import IDENTITY, AccelerometerRange, GyroscopeRange
 from r2p.sim.robots.emulated import Triskar2
 from r2p.tools import imu
-from r2p.tools.calibration import SIDES
+from r2p.tools.calibration import SIDES, CubePosition, Vector, calibrate
+from r2p.tools.imu_svg import draw
 from r2p.tools.session import Settings, TimedOut, join
 from tests.sim.robots.rig import WAIT
 from tests.tools.rig import PATIENCE, robot, tool
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 VIA = "memory:robot"
+SVG = "{http://www.w3.org/2000/svg}"
 OFFSET = (48, -24, 12)  # mg: whole counts in each range
 GYRO_OFFSET = (700, -1400, 350)  # mdps: also
 
@@ -69,17 +72,18 @@ def at_hand(cube: Cube, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.virtual_time
 @pytest.mark.parametrize("write", ["BOT", None])
 async def test_the_module_says_its_ranges(
-    write: str | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    write: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cube = Cube()
     at_hand(cube, monkeypatch)
     async with robot(cube.sensors) as module, tool() as session:
-        await imu.calibrate(session, seconds=0.1, write=write)
+        await imu.calibrate(session, seconds=0.1, write=write, plot=tmp_path / "cube.svg")
         parameters = {name: parameter.value for (_, name), parameter in module.parameters.items()}
     out, err = capsys.readouterr()
     assert [float(each) for each in out.split()[1:4]] == list(OFFSET)
     assert "gyro_offset     700.0  -1400.0    350.0  mdps" in out
     assert "unknown" not in err
+    assert ET.parse(tmp_path / "cube.svg").getroot().tag == f"{SVG}svg"
     assert parameters["acc_offset"] == (OFFSET if write else (0.0,) * 3)
     assert parameters["gyro_offset"] == (GYRO_OFFSET if write else (0.0,) * 3)
     assert ("BOT: 3 parameters of sensors set; r2p param save BOT keeps them" in err) == bool(write)
@@ -201,3 +205,45 @@ async def test_at_a_terminal_it_asks_and_waits_for_enter() -> None:
         # a sample from before the turn may still be on its way: then it moved, and it asks once more
         assert list(dict.fromkeys(asked)) == list(SIDES)
         assert [float(each) for each in out.split()[1:4]] == list(OFFSET)
+
+
+def test_the_plot_has_each_position_before_and_after_and_each_residual() -> None:
+    """The scale is that of the rings: an offset of 48 mg along x, and 12 across z, is there in px."""
+    positions = [
+        CubePosition(side, reading(1000 * up[0] + 48, 1000 * up[1], 1000 * up[2] + 12), (0.0, 0.0, 0.0), 100)
+        for side, up in SIDES.items()
+    ]
+    positions[0] = CubePosition("x", (1048.0, 3.0, 12.0), (0.0, 0.0, 0.0), 100)  # not at a right angle
+    result = calibrate(positions)
+    root = ET.fromstring(draw(positions, result))
+    circles = {style: root.findall(f".//{SVG}circle[@class='{style}']") for style in ("ring", "before", "after")}
+    middles = [(float(each.attrib["cx"]), float(each.attrib["cy"])) for each in circles["ring"][::2]]
+    before = [(float(each.attrib["cx"]), float(each.attrib["cy"])) for each in circles["before"][:6]]
+    px = float(circles["ring"][0].attrib["r"]) / 50  # the largest, 48 and 0 mg across, rounds up to 50
+    y_up = list(SIDES).index("y")  # seen from its pole, z points to the right and x up
+    assert before[y_up][0] - middles[y_up][0] == pytest.approx(12 * px, abs=0.1)
+    assert middles[y_up][1] - before[y_up][1] == pytest.approx(48 * px, abs=0.1)
+    for side, middle, after in zip(SIDES, middles, circles["after"], strict=False):
+        off = math.dist(middle, (float(after.attrib["cx"]), float(after.attrib["cy"])))
+        assert off < 3 * px, side
+    titles = [each.text for each in root.findall(f".//{SVG}rect[@class='bar']/{SVG}title")]
+    assert titles == [
+        f"{side} up, {axis}: {value:z.2f} mg"
+        for side in SIDES
+        for axis, value in zip("xyz", result.residuals[side], strict=True)
+    ]
+    assert max(map(abs, result.residuals["x"])) > 0.5
+    assert "prefers-color-scheme: dark" in draw(positions, result)
+
+
+def test_a_perfect_sensor_has_a_plot_and_a_folder_is_none(tmp_path: Path) -> None:
+    positions = [
+        CubePosition(side, reading(*(1000 * part for part in up)), (0.0,) * 3, 100) for side, up in SIDES.items()
+    ]
+    assert ET.fromstring(draw(positions, calibrate(positions))).tag == f"{SVG}svg"
+    with pytest.raises(r2p.Error, match="Is a directory"):
+        imu._save(tmp_path, "<svg/>")
+
+
+def reading(x: float, y: float, z: float) -> Vector:
+    return x, y, z
