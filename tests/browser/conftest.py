@@ -1,5 +1,7 @@
 """One browser, and one emulated robot with its page, for the whole run; the tests that use them are all in one worker.
 
+They end with these tests: a robot that goes on takes a fifth of a core from all others.
+
 Coroutines here run in the browser's thread.
 """
 
@@ -34,14 +36,14 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     return True
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def loop_thread() -> Generator[rig.LoopThread, None, None]:
     thread = rig.LoopThread()
     yield thread
     thread.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def browser(loop_thread: rig.LoopThread) -> Generator[Browser, None, None]:
     program = install.find()
     if isinstance(program, str):
@@ -52,7 +54,7 @@ def browser(loop_thread: rig.LoopThread) -> Generator[Browser, None, None]:
         yield started
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def robot(browser: Browser) -> Generator[str, None, None]:
     """The URL of the emulated robot, which drives along squares."""
     with process("sim", "--drive", "--allow-control", "--via", "tcp-listen:0", patience=RUN) as child:
@@ -60,7 +62,7 @@ def robot(browser: Browser) -> Generator[str, None, None]:
         yield next(found[1] for line in child.stdout if (found := re.search(r"--via (tcp:\S+)", line)))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def dash(loop_thread: rig.LoopThread, robot: str) -> Generator[rig.Dash, None, None]:
     """The robot's page, which may do all."""
     with loop_thread.opened(rig.serve(robot, publish=True, control=True)) as served:
