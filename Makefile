@@ -45,7 +45,7 @@ lint: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: $(STAMP)
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks $(ROW)
 
 # Seconds, and messages a second (0: as many as are taken): `make soak SECONDS=600 RATE=2000`.
 SECONDS := 3600

@@ -1,7 +1,7 @@
 """Delivery inside one module: publisher to subscriber tasks."""
 
 import asyncio
-import functools
+import statistics
 import time
 from collections.abc import Iterator
 
@@ -64,6 +64,46 @@ async def queue_throughput(messages: int) -> float:
     started = time.perf_counter()
     for number in range(messages):
         await queue.put(number)
+    await consumer
+    return messages / (time.perf_counter() - started)
+
+
+async def queue_yielding(messages: int) -> float:
+    """The same, with a yield after each message: what asyncio alone takes for a message."""
+    queue: asyncio.Queue[Pair] = asyncio.Queue(64)
+
+    async def consume() -> None:
+        for _ in range(messages):
+            await queue.get()
+
+    consumer = asyncio.create_task(consume())
+    started = time.perf_counter()
+    for _ in range(messages):
+        await queue.put(MESSAGE)
+        await asyncio.sleep(0)
+    await consumer
+    return messages / (time.perf_counter() - started)
+
+
+async def future_yielding(messages: int) -> float:
+    """A bare future for each message, with a yield after it: the least that waking another task takes."""
+    loop = asyncio.get_running_loop()
+    waiter: asyncio.Future[Pair] = loop.create_future()
+
+    async def consume() -> None:
+        nonlocal waiter
+        for _ in range(messages):
+            await waiter
+            waiter = loop.create_future()
+
+    consumer = asyncio.create_task(consume())
+    await asyncio.sleep(0)
+    started = time.perf_counter()
+    for _ in range(messages):
+        while waiter.done():
+            await asyncio.sleep(0)  # nothing else than a yield is what is measured
+        waiter.set_result(MESSAGE)
+        await asyncio.sleep(0)
     await consumer
     return messages / (time.perf_counter() - started)
 
@@ -150,15 +190,25 @@ async def wake_latencies(messages: int) -> list[float]:
     return durations
 
 
-def rate_on(loop: str) -> float:
-    """Messages a second to one subscriber."""
-    return run_on(loop, throughput(100_000, 1, each=True))
+async def _one(messages: int) -> float:
+    """Messages a second to one subscriber, yielding each."""
+    return await throughput(messages, 1, each=True)
 
 
 def rows() -> Iterator[Row]:
     cyphal = typical(3, lambda: run_on("asyncio", cyphal_throughput(20_000)))
     for loop, goal in (("asyncio", 200e3), ("uvloop", 350e3)):
-        ours = typical(RUNS, functools.partial(rate_on, loop))
+        # in turn: what else runs on the machine changes
+        turns = [[run_on(loop, each(100_000)) for each in (_one, queue_yielding, future_yielding)] for _ in range(RUNS)]
+        ours, queue, future = (statistics.median(each) for each in zip(*turns, strict=True))
+        against_queue = statistics.median(each[0] / each[1] for each in turns)
+        yield Row(
+            f"publish to one subscriber beside asyncio alone, yielding each ({loop})",
+            rate(ours),
+            f"asyncio.Queue, untyped {rate(queue)}: {against_queue:.2f}x; future {rate(future)}: {ours / future:.2f}x",
+            "0.95x of the Queue",
+            against_queue >= 0.95,
+        )
         yield Row(
             f"publish to one subscriber, yielding each ({loop})",
             rate(ours),

@@ -18,14 +18,15 @@ class Row(NamedTuple):
 def show(rows: Iterable[Row]) -> None:
     """Print each row as soon as it is there."""
     widths = (56, 24, 46, 26)
-    print(_line(("what", "measured", "baseline in the same run", "goal"), widths), "reached")
-    print(_line(tuple("-" * width for width in widths), widths), "-------")
+    print(line(("what", "measured", "baseline in the same run", "goal"), widths), "reached")
+    print(line(tuple("-" * width for width in widths), widths), "-------")
     for row in rows:
         verdict = {True: "yes", False: "NO", None: ""}[row.reached]
-        print(_line((row.what, row.measured, row.baseline, row.goal), widths), verdict, flush=True)
+        print(line((row.what, row.measured, row.baseline, row.goal), widths), verdict, flush=True)
 
 
-def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
+def line(cells: Sequence[str], widths: Sequence[int]) -> str:
+    """A row of a table."""
     return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"
 
 
