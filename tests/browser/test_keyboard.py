@@ -74,6 +74,40 @@ async def test_tab_reaches_what_can_be_pressed_and_shows_where_it_is(browser: Br
         assert {"theme", "help", "input", "a"} <= set(reached)
 
 
+FILTER = """words => {
+    const filter = document.querySelector('.parameters-view [data-filter]')
+    filter.value = words
+    filter.dispatchEvent(new Event('input'))
+}"""
+
+
+async def test_what_comes_beside_it_takes_neither_the_keyboard_nor_a_click(browser: Browser, dash: Dash) -> None:
+    """Others come when their answers do: in the middle of writing a value, or while the button of the mouse is down."""
+    panels = "[...document.querySelectorAll('#view section.panel')].map(each => each.dataset.module).join()"
+    kp = "[data-module=MOTOR2] [data-parameter=kp] input"
+    async with opened(browser, dash.server.url) as tab:
+        await tab.until("['MOTOR1', 'MOTOR2', 'MOTOR3'].every(each => r2p.store.modules.has(each))")
+        await tab.evaluate("view => { location.hash = `#/${view}` }", "parameters/kp")
+        await tab.until(f"{panels} === 'MOTOR1,MOTOR2,MOTOR3'")
+        await tab.evaluate(FILTER, "motor2 kp")
+        await tab.until(f"{panels} === 'MOTOR2'")
+        await tab.page.fill(kp, "-7")
+        await tab.page.hover(kp)
+        await tab.evaluate("""() => {
+            window.clicks = 0
+            document.querySelector('[data-module=MOTOR2]').addEventListener('click', () => window.clicks++)
+        }""")
+        await tab.page.mouse.down()
+        await tab.evaluate(FILTER, "kp")
+        await tab.until(f"{panels} === 'MOTOR1,MOTOR2,MOTOR3'")
+        assert await tab.evaluate("input => document.activeElement === document.querySelector(input)", kp)
+        await tab.page.hover(kp)
+        await tab.page.mouse.up()
+        assert await tab.evaluate("() => window.clicks") == 1
+        await tab.page.keyboard.press("Enter")
+        await tab.until("document.querySelector(argument).getAttribute('aria-invalid') === 'true'", kp)
+
+
 async def test_the_theme_is_kept(browser: Browser, dash: Dash) -> None:
     async with opened(browser, dash.server.url) as tab:
         await tab.until("r2p.hello !== null")

@@ -23,6 +23,37 @@ export function setText(element, text) {
   if (element.textContent !== wanted) element.textContent = wanted
 }
 
+// Make these the children of an element, in this order. Those that stay are not taken out and put back, as they would lose
+// the keyboard then, and a click would be lost that has begun; unless their order changes.
+export function place(parent, elements) {
+  const wanted = new Set(elements)
+  for (const child of [...parent.children]) if (!wanted.has(child)) child.remove()
+  let at = parent.firstElementChild
+  for (const element of elements) {
+    if (element === at) at = at.nextElementSibling
+    else parent.insertBefore(element, at)
+  }
+}
+
+// Show newer content: elements that were made anew, without listeners. Of what is shown only what differs is changed, so
+// that a link in it keeps the keyboard, and a click that has begun.
+export function renew(parent, ...elements) {
+  const before = [...parent.childNodes]
+  for (const [index, fresh] of elements.entries()) {
+    if (index < before.length) renewNode(before[index], fresh)
+    else parent.append(fresh)
+  }
+  for (const old of before.slice(elements.length)) old.remove()
+}
+
+function renewNode(old, fresh) {
+  if (old.isEqualNode(fresh)) return
+  if (old.nodeName !== fresh.nodeName || !fresh.attributes) return old.replaceWith(fresh)
+  for (const { name } of [...old.attributes]) if (!fresh.hasAttribute(name)) old.removeAttribute(name)
+  for (const { name, value } of fresh.attributes) old.setAttribute(name, value)
+  renew(old, ...fresh.childNodes)
+}
+
 export function button(text, act, properties = {}) {
   return h("button", { type: "button", onclick: act, ...properties }, text)
 }

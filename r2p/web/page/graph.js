@@ -1,6 +1,6 @@
 // The graph of nodes and topics: what is published where, how fast, and which edges lose messages or miss deadlines.
 
-import { button, field, filterBox, h, memory, pauseButton, setText } from "./dom.js"
+import { button, field, filterBox, h, memory, pauseButton, renew, setText } from "./dom.js"
 import { count, fixed, plural, UNKNOWN } from "./format.js"
 import { GraphDrawing } from "./graph_drawing.js"
 import { graphOf, Growth, nodeId, shapeOf, topicId } from "./graph_model.js"
@@ -153,13 +153,11 @@ class GraphView {
       h("td", { class: "names" }, list.publish.join(", ") || UNKNOWN),
       h("td", { class: "names" }, list.subscribe.join(", ") || UNKNOWN),
       h("td", { class: "bad" }, list.trouble.join(", "))))
-    const focused = this.#list.contains(document.activeElement) ? document.activeElement.textContent : null
-    this.#list.replaceChildren(h("table", { class: "plain" },
+    renew(this.#list, h("table", { class: "plain" },
       h("caption", { class: "sr-only" }, "Topics, and the nodes that publish and subscribe to them"),
       h("thead", {}, h("tr", {}, heads.map((head, index) => (
         h("th", { scope: "col", class: index === 1 ? "number" : null }, head))))),
       h("tbody", {}, rows)))
-    if (focused) [...this.#list.querySelectorAll("a")].find(each => each.textContent === focused)?.focus()
   }
 
   // Details

@@ -1,7 +1,7 @@
 // One module: its figures, its nodes with what they publish and subscribe, and its links.
 
 import { detailHead, FactList, plainTable, section } from "./detail.js"
-import { h } from "./dom.js"
+import { h, renew } from "./dom.js"
 import { count, duration, fixed, kilobytes, percent, UNKNOWN } from "./format.js"
 
 export class ModuleDetail {
@@ -26,12 +26,12 @@ export class ModuleDetail {
 
   update() {
     const module = this.#app.store.modules.get(this.name)
-    this.#links.replaceChildren(linksOf([...this.#app.store.links.values()].filter(link => link.module === this.name)))
+    renew(this.#links, linksOf([...this.#app.store.links.values()].filter(link => link.module === this.name)))
     if (module === this.#row) return
     this.#row = module
     if (!module) return this.#facts.update([["State", "gone", "bad"]])
     this.#facts.update(figures(module))
-    this.#nodes.replaceChildren(...(module.nodes ?? []).map(node))
+    renew(this.#nodes, ...(module.nodes ?? []).map(node))
   }
 
   close() {

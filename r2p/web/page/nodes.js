@@ -1,7 +1,7 @@
 // Modules and their nodes: what runs, and orders to start, stop, restart and reboot.
 
 import { attempt, confirmed } from "./dialogs.js"
-import { button, filterBox, h, setText } from "./dom.js"
+import { button, filterBox, h, place, setText } from "./dom.js"
 import { count, duration, percent, plural, UNKNOWN } from "./format.js"
 
 const STATES = { running: "good", stopped: "warn", boot: "warn", observer: "" }
@@ -80,10 +80,7 @@ class NodesView {
     for (const name of this.#panels.keys()) if (!store.modules.has(name)) this.#panels.delete(name)
     const shown = modules.filter(module => this.#matches(module))
     for (const module of shown) this.#panel(module).update(module, { control: Boolean(hello?.control) })
-    const elements = shown.map(module => this.#panel(module).element)
-    const isSame = (element, index) => this.#list.children[index] === element
-    const isSameList = elements.length === this.#list.children.length && elements.every(isSame)
-    if (!isSameList) this.#list.replaceChildren(...elements)
+    place(this.#list, shown.map(module => this.#panel(module).element))
     this.#empty.hidden = shown.length > 0
     setText(this.#empty, modules.length ? "Nothing matches the filter" : "No modules yet")
     const all = modules.reduce((sum, module) => sum + (module.nodes?.length ?? 0), 0)
@@ -156,10 +153,7 @@ class ModulePanel {
     this.#table.hidden = !list.length
     const rows = new Map(list.map(node => [node.name, this.#rows.get(node.name) ?? this.#row(node)]))
     for (const node of list) rows.get(node.name).update(node)
-    const elements = [...rows.values()].map(row => row.element)
-    const isSame = (element, index) => this.#body.children[index] === element
-    const isSameList = elements.length === this.#body.children.length && elements.every(isSame)
-    if (!isSameList) this.#body.replaceChildren(...elements)
+    place(this.#body, [...rows.values()].map(row => row.element))
     this.#rows = rows
   }
 

@@ -2,7 +2,7 @@
 // #/overview/module/NAME.
 
 import { BusCard } from "./bus_card.js"
-import { filterBox, h, memory, oncePerFrame, pauseButton, setText } from "./dom.js"
+import { filterBox, h, memory, oncePerFrame, pauseButton, place, setText } from "./dom.js"
 import { count, duration, fixed, kilobytes, milliseconds, percent, total, UNKNOWN } from "./format.js"
 import { ModuleDetail } from "./module_detail.js"
 import { LiveTable } from "./table.js"
@@ -240,8 +240,7 @@ class OverviewView {
       return card.element
     })
     this.busSection.hidden = !cards.length
-    if (cards.some((card, index) => card !== this.#busBox.children[index]) || cards.length !== this.#busBox.children.length)
-      this.#busBox.replaceChildren(...cards)
+    place(this.#busBox, cards)
   }
 
   #updateTotals(topics, buses) {

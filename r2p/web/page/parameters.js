@@ -1,7 +1,7 @@
 // The parameters of all modules and nodes: read, set, taken back and saved.
 
 import { attempt, toast } from "./dialogs.js"
-import { button, filterBox, h, setText } from "./dom.js"
+import { button, filterBox, h, place, setText } from "./dom.js"
 import { plural } from "./format.js"
 import { blamed, byNode, isSame, limitsText, notesOf, parseValue, valueText } from "./parameter_values.js"
 
@@ -100,9 +100,7 @@ class ParametersView {
   #show() {
     const sorted = [...this.#modules.values()].sort((one, other) => (one.name < other.name ? -1 : 1))
     const shown = sorted.filter(module => module.filter(this.#words))
-    const isSameList = shown.length === this.#list.children.length
-      && shown.every((module, index) => this.#list.children[index] === module.element)
-    if (!isSameList) this.#list.replaceChildren(...shown.map(module => module.element))
+    place(this.#list, shown.map(module => module.element))
     this.#empty.hidden = shown.length > 0
     setText(this.#empty, this.#words.length && sorted.length
       ? "Nothing matches the filter"
@@ -161,10 +159,7 @@ class ModuleParameters {
       node.take(parameters)
       return node
     })
-    const elements = this.#nodes.map(node => node.element)
-    const isSameList = elements.length === this.#body.children.length
-      && elements.every((element, index) => this.#body.children[index] === element)
-    if (!isSameList) this.#body.replaceChildren(...elements)
+    place(this.#body, this.#nodes.map(node => node.element))
     this.#save.hidden = !this.#app.hello?.control || !list.length
   }
 
@@ -215,9 +210,7 @@ class NodeParameters {
       row.take(parameter, { control: Boolean(this.#app.hello?.control) })
       return [parameter.name, row]
     }))
-    const elements = [...this.#rows.values()].map(row => row.element)
-    if (elements.some((element, index) => this.#body.children[index] !== element)
-      || elements.length !== this.#body.children.length) this.#body.replaceChildren(...elements)
+    place(this.#body, [...this.#rows.values()].map(row => row.element))
     this.#changed()
   }
 

@@ -1,7 +1,7 @@
 // Publishing by hand: a form made from the type of a topic, once or at a rate.
 
 import { toast } from "./dialogs.js"
-import { button, field, h, setText } from "./dom.js"
+import { button, field, h, place, setText } from "./dom.js"
 import { plural } from "./format.js"
 import { MessageForm } from "./message_form.js"
 
@@ -24,6 +24,7 @@ class PublishView {
   #typeName = ""
   #forms = new Map() // by topic: what was written there stays
   #running = new Map() // by topic: {rate, sent}
+  #lines = new Map() // by topic, of the list of these
   #hint = h("p", { class: "hint", hidden: true },
     "Nothing can be published here: start r2p dash with --allow-publish to publish from this page.")
   #names = h("datalist", { id: "publish-topics" })
@@ -225,12 +226,21 @@ class PublishView {
   }
 
   #drawRunning() {
-    const focused = this.#list.contains(document.activeElement) ? document.activeElement.dataset.topic : null
-    this.#list.replaceChildren(...[...this.#running].map(([topic, { rate, sent }]) => h("li", { dataset: { topic } },
-      h("span", { class: "chip warn" }, `${topic} at ${rate} Hz`), h("span", { class: "dim" }, `${sent} sent`),
-      button("Stop", () => this.#stop(topic), { class: "danger", "aria-label": `Stop ${topic}`, dataset: { topic } }))))
-    if (focused) [...this.#list.querySelectorAll("button")].find(each => each.dataset.topic === focused)?.focus()
+    const topics = [...this.#running.keys()]
+    this.#lines = new Map(topics.map(topic => [topic, this.#lines.get(topic) ?? this.#line(topic)]))
+    for (const [topic, { rate, sent }] of this.#running) this.#lines.get(topic).update(rate, sent)
+    place(this.#list, [...this.#lines.values()].map(line => line.element))
     this.#chip.hidden = !this.#running.size
     setText(this.#chip, `publishing ${plural(this.#running.size, "topic")}`)
+  }
+
+  #line(topic) {
+    const [what, count] = [h("span", { class: "chip warn" }), h("span", { class: "dim" })]
+    const stop = button("Stop", () => this.#stop(topic), { class: "danger", "aria-label": `Stop ${topic}` })
+    const update = (rate, sent) => {
+      setText(what, `${topic} at ${rate} Hz`)
+      setText(count, `${sent} sent`)
+    }
+    return { element: h("li", { dataset: { topic } }, what, count, stop), update }
   }
 }

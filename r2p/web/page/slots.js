@@ -1,7 +1,7 @@
 // The slots of RTCAN buses: who owns which, which are free or reserved and not used, and the load against the budget.
 
 import { kindName, LoadBar, sharesOf } from "./bus_load.js"
-import { h, pauseButton, setText } from "./dom.js"
+import { h, pauseButton, place, setText } from "./dom.js"
 import { count, fixed, milliseconds, percent, plural, UNKNOWN } from "./format.js"
 import { LiveTable } from "./table.js"
 
@@ -27,9 +27,7 @@ export const slots = {
         drawn.get(name).update(bus)
       }
       for (const name of drawn.keys()) if (!app.store.buses.has(name)) drawn.delete(name)
-      const wanted = [...drawn.keys()].sort().map(name => drawn.get(name).element)
-      const isSame = (element, index) => buses.children[index] === element
-      if (buses.children.length !== wanted.length || !wanted.every(isSame)) buses.replaceChildren(...wanted)
+      place(buses, [...drawn.keys()].sort().map(name => drawn.get(name).element))
     }
     return {
       element: h("section", { class: "view" },

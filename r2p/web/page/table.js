@@ -1,6 +1,6 @@
 // Tables of live figures: sorted by a click on a head, filtered, and changed only where something has changed.
 
-import { button, h, memory, setText } from "./dom.js"
+import { button, h, memory, place, setText } from "./dom.js"
 import { UNKNOWN } from "./format.js"
 
 const ROWS = 400 // shown before one asks for the rest: a browser lays out thousands slowly
@@ -115,17 +115,13 @@ export class LiveTable {
   #place(rows) {
     const before = this.#shown
     this.#shown = new Map()
-    let at = this.#body.firstChild
     for (const row of rows) {
       const key = this.#key(row)
       const line = before.get(key) ?? this.#line()
       this.#shown.set(key, line)
-      before.delete(key)
       if (line.row !== row) this.#fill(line, row)
-      if (line.element === at) at = at.nextSibling
-      else this.#body.insertBefore(line.element, at)
     }
-    for (const line of before.values()) line.element.remove()
+    place(this.#body, [...this.#shown.values()].map(line => line.element))
   }
 
   #line() {

@@ -1,7 +1,7 @@
 // One topic: its figures, its publishers and subscribers, and the fields of its newest message while they change.
 
 import { detailHead, FactList, plainTable, section } from "./detail.js"
-import { button, color, h, setText } from "./dom.js"
+import { button, color, h, renew, setText } from "./dom.js"
 import { clock, count, fixed, kilobytes, milliseconds, number, UNKNOWN } from "./format.js"
 
 const SHOWN_MAX = 300 // fields
@@ -46,8 +46,8 @@ export class TopicDetail {
     if (!topic) return this.#facts.update([["State", "gone: it has neither publishers nor subscribers", "warn"]])
     this.#facts.update(figures(topic))
     this.#offer(topic)
-    this.#publishers.replaceChildren(publishersOf(topic))
-    this.#subscribers.replaceChildren(subscribersOf(topic))
+    renew(this.#publishers, publishersOf(topic))
+    renew(this.#subscribers, subscribersOf(topic))
   }
 
   close() {

@@ -6,6 +6,7 @@ import { test } from "node:test"
 const page = process.env.R2P_PAGE
 const load = name => import(`${page}/${name}.js`)
 
+const { place } = await load("dom")
 const { arrange, edgeKey } = await load("graph_layout")
 const { graphOf, Growth, isInfrastructure, shapeOf } = await load("graph_model")
 const { controlOf, parseList, parseNumber, parseText, tree, zero } = await load("message_fields")
@@ -187,4 +188,56 @@ test("the grid has round steps", () => {
   assert.equal(lengthText(0.3, 0.1), "30 cm")
   assert.equal(lengthText(1500, 500), "1500 m")
   assert.equal(lengthText(3000, 1000), "3 km")
+})
+
+// As much of an element as `place` needs. Whatever is taken out loses the keyboard, also when it is put back at once.
+class Box {
+  children = []
+  parent = null
+  losses = 0
+
+  get firstElementChild() {
+    return this.children[0] ?? null
+  }
+
+  get nextElementSibling() {
+    return this.parent.children[this.parent.children.indexOf(this) + 1] ?? null
+  }
+
+  insertBefore(child, next) {
+    child.remove()
+    this.children.splice(next ? this.children.indexOf(next) : this.children.length, 0, child)
+    child.parent = this
+  }
+
+  remove() {
+    if (!this.parent) return
+    this.parent.children.splice(this.parent.children.indexOf(this), 1)
+    this.parent = null
+    this.losses++
+  }
+}
+
+test("children that stay keep the keyboard, wherever others come and go", () => {
+  const boxes = Array.from({ length: 5 }, () => new Box())
+  const subset = mask => boxes.filter((_, index) => mask >> index & 1)
+  for (let before = 0; before < 32; before++) {
+    for (let after = 0; after < 32; after++) {
+      const parent = new Box()
+      for (const box of boxes) Object.assign(box, { parent: null, losses: 0 })
+      place(parent, subset(before))
+      place(parent, subset(after))
+      assert.deepEqual(parent.children, subset(after))
+      for (const box of subset(before & after)) assert.equal(box.losses, 0)
+    }
+  }
+})
+
+test("children whose order changes are in the new one", () => {
+  const boxes = Array.from({ length: 4 }, () => new Box())
+  const parent = new Box()
+  for (const order of [[0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0], [0, 1, 2, 3], [2], [], [2, 0]]) {
+    place(parent, order.map(index => boxes[index]))
+    assert.deepEqual(parent.children, order.map(index => boxes[index]))
+  }
 })
