@@ -6,6 +6,7 @@ import { plural } from "./format.js"
 import { blamed, byNode, isSame, limitsText, notesOf, parseValue, valueText } from "./parameter_values.js"
 
 const AT_ONCE = 4 // modules that are asked at the same time
+const ASK_AGAIN = 5_000 // ms after which one that did not answer is asked again
 
 export const parameters = {
   id: "parameters",
@@ -73,8 +74,9 @@ class ParametersView {
   #findModules() {
     const { modules } = this.#app.store
     for (const { name, kind, link } of modules.values()) {
-      if (kind === "firmware" || (!link && !this.#app.hello?.recording) || this.#modules.has(name)) continue
-      const module = new ModuleParameters(this.#app, name)
+      if (kind === "firmware" || (!link && !this.#app.hello?.recording)) continue
+      if (this.#modules.get(name)?.isFine()) continue
+      const module = this.#modules.get(name) ?? new ModuleParameters(this.#app, name)
       this.#modules.set(name, module)
       this.#ask(module)
     }
@@ -117,6 +119,7 @@ class ModuleParameters {
   #body = h("div", { class: "stack" })
   #read = false
   #failed = false
+  #askedAt = 0 // ms
 
   constructor(app, name) {
     this.#app = app
@@ -132,7 +135,13 @@ class ModuleParameters {
     return this.#nodes.reduce((sum, node) => sum + node.size, 0)
   }
 
+  // Return whether there is no reason to ask it again: it has answered, or may still do so.
+  isFine() {
+    return !this.#failed || performance.now() < this.#askedAt + ASK_AGAIN
+  }
+
   async read() {
+    this.#askedAt = Infinity
     try {
       this.#take(await this.#app.connection.request("parameters", { module: this.name }))
       this.#failed = false
@@ -141,6 +150,7 @@ class ModuleParameters {
       this.#failed = true
       setText(this.#error, error.message)
     }
+    this.#askedAt = performance.now()
     this.#read = true
   }
 
