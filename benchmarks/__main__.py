@@ -28,6 +28,7 @@ ALL = (
     "monitoring",
     "top",
     "rtcan",
+    "admission",
     "simulated_can",
     "timers",
     "playing",

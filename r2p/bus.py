@@ -6,7 +6,7 @@
         async for seen in bus:
             print(seen.kind.value, seen.topic, seen.frame.data.hex())
 
-`Calendar` is the master's: here it plans reservations without a bus.
+`Calendar` is the master's: here it plans reservations without a bus. `PeriodRule` says which periods go together.
 
 The port is that of a module, with a `Monitor` in place of an engine.
 """
@@ -20,7 +20,7 @@ from r2p.clock import SHORTEST, check_seconds, clock_of
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import Closed, Error
 from r2p.protocols.can_orders import Mailbox, Outcome
-from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
+from r2p.protocols.rtcan.calendar import Calendar, PeriodRule, Refusal, Reservation, occupied
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.monitor import BusLoad, BusSlot, FrameKind, Monitor, SeenFrame
 from r2p.transports.stats import LoggedCounter
@@ -36,6 +36,7 @@ __all__ = [
     "BusSlot",
     "Calendar",
     "FrameKind",
+    "PeriodRule",
     "Refusal",
     "Reservation",
     "SeenFrame",

@@ -184,12 +184,13 @@ CLAIM_ELECTING = 2  # the module knows no master
 class RefuseReason(enum.IntEnum):
     """The reason why a master grants no slots: `Refuse.reason`."""
 
-    PERIOD = 1  # not harmonic with the cycle: neither divides the other
-    OTHER = 2  # not harmonic with the period of another message
+    PERIOD = 1  # the master keeps the harmonic rule: neither this period divides the cycle nor the cycle it
+    OTHER = 2  # the same, for the period of another message
     LENGTH = 3  # too short for the fragments, or too long
     FULL = 4  # not so many slots in a row are free
     TAKEN = 5  # the slots that it had were given to another message
     MANY = 6  # no further reservation can be kept
+    FACTOR = 7  # the greatest common factor with the cycle, or with the period of another message, is too small
 
 
 SIZE_VARIES = 0x8000

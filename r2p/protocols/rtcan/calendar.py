@@ -1,14 +1,21 @@
 """The calendar of reserved slots at the master (PROTOCOL.md 6, thesis 4.3.4).
 
 Slots are counted through: slot s of cycle c is number c * slots + s. A reservation of period p, phase f and k fragments
-owns the numbers f .. f + k - 1 and all that differ from them by a multiple of p. Of every two reservations, the sync's
-included (period: the cycle, phase 0, one slot), one period divides the other: so they share no slot if they share none
-within the shorter of the two periods. So the slots that are free for a period are an integer of that many bits.
+owns the numbers f .. f + k - 1 and all that differ from them by a multiple of p. Two reservations of periods p and q,
+the sync's included (period: the cycle, phase 0, one slot), share a slot some day if, and only if, their slots meet
+modulo the greatest common divisor of p and q, as the sums of a multiple of p and one of q are just the multiples of
+that. So periods need a common factor, as the thesis says, and the slots that are free for a period p are an integer of
+p bits.
+
+By the harmonic rule, which the firmware's calendar keeps, one of every two periods also has to divide the other.
 
 Since slot 0 of every cycle is the sync's, the slots of one occurrence never span two cycles.
 """
 
+import enum
+import math
 from collections.abc import Iterator
+from itertools import islice
 
 import msgspec
 
@@ -18,6 +25,19 @@ from r2p.codecs.rtcan import SLOTS_MAX
 PERIOD_MAX = 1 << 16
 """In slots: about 11 s in slots of 166 us."""
 _RESERVATIONS_MAX = 1024  # each one makes an admission slower
+_FULL_MAX = 16  # periods without free slots that are tried when a period is rounded down
+_PHASES_MAX = 512  # phases that are compared, from the least one on
+_SHORT = range(2, 17)  # periods in slots: those that other messages can hardly get once their residues are taken
+_WHOLE = 1 << 20  # the loss that stands for all phases of a period
+
+
+class PeriodRule(enum.Enum):
+    """Which periods go together."""
+
+    COMMON_FACTORS = "common-factors"
+    """All with common factors (thesis 4.3.4)."""
+    HARMONIC = "harmonic"
+    """Of every two, one divides the other, and a message gets the least free phase: what the firmware does."""
 
 
 class Reservation(msgspec.Struct, frozen=True):
@@ -47,6 +67,13 @@ class Refusal(msgspec.Struct, frozen=True):
     def text(self) -> str:
         """The reason in words."""
         match self.reason:
+            case RefuseReason.FACTOR:
+                factor = math.gcd(self.period, self.other)
+                whose = f"of message 0x{self.rival:04X}" if self.rival else "of a cycle"
+                return (
+                    f"a period of {self.period} slots meets the {self.other} {whose} at each phase: their greatest "
+                    f"common factor is {factor}"
+                )
             case RefuseReason.PERIOD:
                 return f"a period of {self.period} slots neither divides the {self.other} of a cycle nor is a multiple"
             case RefuseReason.OTHER:
@@ -69,10 +96,11 @@ class Refusal(msgspec.Struct, frozen=True):
 class Calendar:
     """All reservations of a network with cycles of `slots`. Raises ValueError unless those are 2..64."""
 
-    def __init__(self, slots: int) -> None:
+    def __init__(self, slots: int, rule: PeriodRule = PeriodRule.COMMON_FACTORS) -> None:
         if not 2 <= slots <= SLOTS_MAX:
             raise ValueError(f"{slots} slots: a cycle has 2 to {SLOTS_MAX}")
         self.slots = slots
+        self.rule = rule
         self._entries: dict[int, Reservation] = {}
 
     def __iter__(self) -> Iterator[Reservation]:
@@ -87,21 +115,24 @@ class Calendar:
     def admit(
         self, message: int, period: int, fragments: int = 1, *, round_down: bool = False
     ) -> Reservation | Refusal:
-        """Reserve slots, with the least possible phase; `round_down`: with the longest possible period up to this one.
+        """Reserve slots, at the phase that leaves most to others, or the least one by the harmonic rule.
 
-        A message that has slots of another period or size gives those back first.
+        `round_down`: with the longest possible period up to this one that divides the cycle or is a multiple of it,
+        else with this one. A message that has slots of another period or size gives those back first.
         """
-        wanted = self._wanted(message, period, round_down)
-        before = self._entries.get(message)
-        if before is not None and (before.period, before.fragments) == (wanted, fragments):
-            return before
-        self.remove(message)  # its own slots are free for it
-        if (refusal := self._impossible(message, wanted, fragments)) is not None:
-            return refusal
-        phase = _first_run(self.free(wanted), fragments)
-        if phase is None:
-            return Refusal(message, RefuseReason.FULL, wanted, fragments)
-        return self._enter(Reservation(message, wanted, phase, fragments))
+        before = self._entries.pop(message, None)  # its own slots are free for it
+        refusals: list[Refusal] = []
+        for wanted in self._candidates(period, round_down):
+            if before is not None and (before.period, before.fragments) == (wanted, fragments):
+                return self._enter(before)
+            outcome = self._place(message, wanted, fragments)
+            if isinstance(outcome, Reservation):
+                return self._enter(outcome)
+            refusals.append(outcome)
+            if sum(each.reason is RefuseReason.FULL for each in refusals) == _FULL_MAX:
+                break
+        full = (each for each in refusals if each.reason is RefuseReason.FULL)
+        return next(full, refusals[0])
 
     def readmit(self, reservation: Reservation) -> Reservation | Refusal:
         """Enter a reservation that another master granted, with its phase."""
@@ -121,10 +152,10 @@ class Calendar:
         return self._entries.pop(message, None) is not None
 
     def free(self, period: int) -> int:
-        """Return a mask; bit i: no reservation owns slot i, or one that differs from it by a multiple of the period."""
-        free = (1 << period) - 1 & ~_comb(self.slots, 0, 1, period)
+        """Return a mask; bit i: no reservation ever owns slot i, or one that differs by a multiple of the period."""
+        free = (1 << period) - 1 & ~_comb(math.gcd(self.slots, period), 0, 1, period)
         for each in self._entries.values():
-            free &= ~_comb(each.period, each.phase, each.fragments, period)
+            free &= ~_comb(math.gcd(each.period, period), each.phase, each.fragments, period)
         return free
 
     def mask(self, cycle: int) -> int:
@@ -139,27 +170,67 @@ class Calendar:
         self._entries[reservation.message] = reservation
         return reservation
 
-    def _wanted(self, message: int, period: int, round_down: bool) -> int:
-        """Return the longest period up to `period` that is harmonic with all others, else `period` itself."""
+    def _candidates(self, period: int, round_down: bool) -> Iterator[int]:
+        """Yield the periods to try, in order: at least one."""
         if not round_down or not 1 < period <= PERIOD_MAX:
-            return period
-        others = {each.period for each in self._entries.values() if each.message != message} | {self.slots}
-        for shorter in _candidates(period, self.slots):
-            if all(_harmonic(shorter, other) for other in others):
-                return shorter
-        return period
+            yield period
+            return
+        yield from range(period - period % self.slots, 0, -self.slots)
+        yield from (divisor for divisor in range(min(period, self.slots - 1), 1, -1) if self.slots % divisor == 0)
+        yield period
+
+    def _place(self, message: int, period: int, fragments: int) -> Reservation | Refusal:
+        if (refusal := self._impossible(message, period, fragments)) is not None:
+            return refusal
+        starts = _starts(self.free(period), fragments)
+        if not starts:
+            return Refusal(message, RefuseReason.FULL, period, fragments)
+        return Reservation(message, period, self._phase(starts, period, fragments), fragments)
+
+    def _phase(self, starts: int, period: int, fragments: int) -> int:
+        """Return the phase of those possible that takes the least from others; the least one of equal phases."""
+        if self.rule is PeriodRule.HARMONIC:
+            return next(_set_bits(starts))
+        losses = self._losses(period, fragments)
+        return min(
+            islice(_set_bits(starts), _PHASES_MAX),
+            key=lambda phase: sum(loss[phase % len(loss)] for loss in losses),
+        )
+
+    def _losses(self, period: int, fragments: int) -> list[list[int]]:
+        """Return the share of each short period's free phases that a new reservation takes, by its phase's residue.
+
+        Most of them meet at the residues that others have spoiled already, where a new one costs nothing.
+        """
+        losses = []
+        for short in _SHORT:
+            factor, free = math.gcd(short, period), self.free(short)
+            if free and factor > 1:
+                taken = (_comb(factor, residue, fragments, short) & free for residue in range(factor))
+                losses.append([_WHOLE * each.bit_count() // free.bit_count() for each in taken])
+        return losses
 
     def _impossible(self, message: int, period: int, fragments: int) -> Refusal | None:
         if not 1 < period <= PERIOD_MAX or not 0 < fragments < period:
             return Refusal(message, RefuseReason.LENGTH, period, fragments)
-        if not _harmonic(period, self.slots):
-            return Refusal(message, RefuseReason.PERIOD, period, fragments, self.slots)
+        if (reason := self._clash(period, fragments, self.slots, 1)) is not None:
+            reason = RefuseReason.PERIOD if reason is RefuseReason.OTHER else reason
+            return Refusal(message, reason, period, fragments, self.slots)
         for each in self._entries.values():
-            if not _harmonic(period, each.period):
-                return Refusal(message, RefuseReason.OTHER, period, fragments, each.period, each.message)
+            if (reason := self._clash(period, fragments, each.period, each.fragments)) is not None:
+                return Refusal(message, reason, period, fragments, each.period, each.message)
         if len(self._entries) >= _RESERVATIONS_MAX:
             return Refusal(message, RefuseReason.MANY, period, fragments)
         return None
+
+    def _clash(self, period: int, fragments: int, other: int, others: int) -> RefuseReason | None:
+        """Return why two periods don't go together, at whatever phases; `others`: fragments of the other one."""
+        factor = math.gcd(period, other)
+        if factor in (period, other):
+            return None  # what is possible depends on the phases
+        if self.rule is PeriodRule.HARMONIC:
+            return RefuseReason.OTHER
+        return RefuseReason.FACTOR if factor < fragments + others else None
 
 
 def occupied(reservation: Reservation, start: int, slots: int) -> int:
@@ -171,32 +242,27 @@ def occupied(reservation: Reservation, start: int, slots: int) -> int:
     return _comb(period, offset, reservation.fragments, slots)
 
 
-def _harmonic(a: int, b: int) -> bool:
-    return a % b == 0 or b % a == 0
-
-
-def _candidates(period: int, slots: int) -> Iterator[int]:
-    """Yield the periods up to this one that are harmonic with the cycle, the longest first."""
-    yield from range(period - period % slots, 0, -slots)
-    yield from (divisor for divisor in range(min(period, slots - 1), 1, -1) if slots % divisor == 0)
-
-
 def _comb(period: int, phase: int, fragments: int, length: int) -> int:
-    """Bits phase .. phase + fragments - 1, and all that differ by multiples of the period, modulo `length`."""
-    if fragments >= length:
+    """Return the bits below `length` that differ from phase .. phase + fragments - 1 by a multiple of the period."""
+    if fragments >= period:
         return (1 << length) - 1
-    train = (1 << fragments) - 1
-    if period >= length:
-        bits = train << phase % length
-        return (bits | bits >> length) & (1 << length) - 1
-    # A bit for each occurrence: 1 + 2**p + 2**2p + ... is a geometric series. The product repeats the train there.
-    teeth = ((1 << -(-length // period) * period) - 1) // ((1 << period) - 1)
-    return (train << phase % period) * teeth & (1 << length) - 1
+    bits = ((1 << fragments) - 1) << phase % period
+    tooth = (bits | bits >> period) & (1 << period) - 1
+    if period < length:
+        # A bit for each tooth: 1 + 2**p + 2**2p + ... is a geometric series. The product repeats the tooth there.
+        tooth *= ((1 << -(-length // period) * period) - 1) // ((1 << period) - 1)
+    return tooth & (1 << length) - 1
 
 
-def _first_run(free: int, length: int) -> int | None:
-    """The index of the first `length` set bits in a row."""
+def _starts(free: int, length: int) -> int:
+    """Return the bits where so many set bits in a row begin."""
     starts = free
     for shift in range(1, length):
         starts &= free >> shift  # bit i stays set while bits i .. i + shift are free
-    return (starts & -starts).bit_length() - 1 if starts else None
+    return starts
+
+
+def _set_bits(bits: int) -> Iterator[int]:
+    while bits:
+        yield (bits & -bits).bit_length() - 1
+        bits &= bits - 1

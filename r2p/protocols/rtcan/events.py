@@ -15,6 +15,7 @@ from r2p.codecs import rtcan
 from r2p.codecs.can_bits import start_of_frame
 from r2p.codecs.rtcan import MESSAGE_MAX, MESSAGE_SHIFT, Frame
 from r2p.protocols.can_orders import Mailbox, Transmit, Withdraw
+from r2p.protocols.rtcan.calendar import PeriodRule
 from r2p.protocols.rtcan.cycle import Cycle, timing
 from r2p.protocols.timers import KeyedTimers
 
@@ -35,6 +36,7 @@ class EngineSettings(msgspec.Struct, frozen=True, kw_only=True):
     - `listen`: the time before anything is sent. `receive_latency`: from the end of a frame to its stamp.
       `transmit_latency`: from the hand-over of a frame to its start. `coarse`: the port can't hit a slot; so a frame
       may start anywhere in a run of free slots.
+    - `periods`: as the master, which periods go together.
     - `reserves`: ask for slots for periodic messages. `capacity`: messages in the queue.
     """
 
@@ -49,6 +51,7 @@ class EngineSettings(msgspec.Struct, frozen=True, kw_only=True):
     receive_latency: int = 0
     transmit_latency: int = 0
     coarse: bool = False
+    periods: PeriodRule = PeriodRule.COMMON_FACTORS
     reserves: bool = True
     capacity: int = 256
 

@@ -24,6 +24,7 @@ from r2p.units import LONG_AGO, MILLISECOND, SECOND
 LEASE = 3_000_000_000  # ns, as the next two: two renewals may be lost
 _RENEWAL = SECOND
 _RETRY = 250_000_000
+_PLANS_MAX = 256  # plans of cycles that are kept
 _AHEAD = 1  # cycles from a grant to its first slot: by then all nodes have the new mask
 
 
@@ -31,6 +32,7 @@ class PeriodicMessage(msgspec.Struct, eq=False):
     """A message that goes every `interval` ns. `lead`: how long before its slot its data are needed (ns). It has `size`
     bytes; at most so many if its length `varies`: then it leaves some of its slots empty.
 
+    `exact`: the interval is a whole number of slots, so it is asked for as it is before a shorter one will do.
     `active`: its slots may be used, from `from_cycle` on. Of an occurrence: `payload` to send in so many `frames`,
     those `sent`, and `waiting`, the number of the slot for which data were asked but not given yet. Without slots:
     `tick`, when it is due next, and `ticked`, whether data were asked. Of its requests: `asked`, when each was sent, by
@@ -45,6 +47,7 @@ class PeriodicMessage(msgspec.Struct, eq=False):
     lead: int
     handle: Hashable
     varies: bool = False
+    exact: bool = False
     reservation: Reservation | None = None
     active: bool = False
     from_cycle: int = 0
@@ -81,8 +84,8 @@ _Fills = dict[int, list[tuple[PeriodicMessage, int]]]
 class SlotPlan:
     """The plan for the slots of the current cycle. Slot 0 of the next cycle counts as the last one of this.
 
-    The plan repeats after the least common multiple of all periods, which is the longest of them: each cycle up to
-    there is worked out once.
+    The plan repeats after the least common multiple of all periods: each cycle up to there is worked out once, unless
+    there are too many of them to be kept.
     """
 
     def __init__(self, timing: Timing) -> None:
@@ -111,6 +114,8 @@ class SlotPlan:
             self._restart(cycle)
         known = self._cycles.get(cycle % self._span)
         if known is None:
+            if len(self._cycles) >= _PLANS_MAX:
+                self._cycles.clear()
             known = self._cycles[cycle % self._span] = self._work_out(cycle)
         self.sends, self.fills, self.next, self.own = known
 
@@ -151,7 +156,7 @@ class SlotGrants:
     """The master's side: the granted slots, and until when."""
 
     def __init__(self, context: EngineContext) -> None:
-        self.calendar = Calendar(context.timing.slots)
+        self.calendar = Calendar(context.timing.slots, context.settings.periods)
         self.collecting = False
         """True while only grants of another master are renewed."""
         self._cycle = context.cycle
@@ -224,6 +229,7 @@ class SlotRequests:
 
     def start(self, now: int, periodic: PeriodicMessage) -> None:
         """Request slots, and let the message go without until they are granted."""
+        periodic.exact = self._is_whole(periodic)
         self.schedule(now, periodic)
         self._start_ticking(now, periodic)
 
@@ -246,6 +252,7 @@ class SlotRequests:
         """Request slots, now that there is a master."""
         self.has_master = True
         for each in self._periodics.values():
+            each.exact = self._is_whole(each)
             self.schedule(now, each)
 
     def pause(self, now: int, reason: str) -> None:
@@ -290,7 +297,7 @@ class SlotRequests:
             self._ask(now, Reserve(periodic.message, serial, held.fragments, held.period, held.phase))
             return
         period = min(periodic.interval // self._cycle.timing.slot, NO_PHASE - 1)
-        flags = management.RESERVE_ROUND_DOWN
+        flags = 0 if periodic.exact else management.RESERVE_ROUND_DOWN
         self._ask(now, Reserve(periodic.message, serial, periodic.fragments, period, flags=flags))
 
     def renew(self, now: int) -> None:
@@ -345,6 +352,10 @@ class SlotRequests:
             reason = RefuseReason(refuse.reason)
         except ValueError:  # of a newer version
             return
+        if periodic.exact and periodic.reservation is None:
+            periodic.exact = False  # ask again, for a shorter one
+            self._timers.set(("ask", periodic.high), now)
+            return
         period, fragments, other, rival = refuse.period, refuse.fragments, refuse.other, refuse.rival
         text = Refusal(periodic.message, reason, period, fragments, other, rival).text
         self.revoke(now, periodic, text)
@@ -370,6 +381,12 @@ class SlotRequests:
             periodic.restart()
             self._plan.invalidate()
             self._actions.append(SlotsLost(periodic.high, reason))
+
+    def _is_whole(self, periodic: PeriodicMessage) -> bool:
+        """Return whether the interval is a number of slots that would be rounded down: else this is no matter."""
+        period, rest = divmod(periodic.interval, self._cycle.timing.slot)
+        slots = self._cycle.timing.slots
+        return not rest and math.gcd(period, slots) not in (period, slots)
 
     def _start_ticking(self, now: int, periodic: PeriodicMessage) -> None:
         if ("tick", periodic.high) not in self._timers:

@@ -4,6 +4,7 @@
 followed by `!` if it missed the slot in some cycles; `+` is a free slot that events use.
 """
 
+import math
 import re
 import string
 from collections.abc import Iterable
@@ -15,7 +16,7 @@ import msgspec
 import typer
 
 import r2p
-from r2p.bus import BusMonitor, BusSlot, Calendar, Refusal, Reservation, Timing, occupied, timing
+from r2p.bus import BusMonitor, BusSlot, Calendar, PeriodRule, Refusal, Reservation, Timing, timing
 from r2p.codecs import rtcan
 from r2p.tools.options import Format, hertz, seconds, time_option
 from r2p.tools.output import Output, Record
@@ -149,6 +150,9 @@ def admit(
     bitrate: Annotated[
         int, typer.Option("--bitrate", min=10_000, metavar="BIT/S", help="Bit rate of the bus.")
     ] = 1_000_000,
+    periods: Annotated[
+        PeriodRule, typer.Option("--periods", help="harmonic: as the calendar of firmware does it.")
+    ] = PeriodRule.COMMON_FACTORS,
     svg: Svg = None,
     format: Format = None,
 ) -> None:
@@ -156,12 +160,14 @@ def admit(
 
     It shows in which slots, and what is left. It opens no bus.
 
-    Messages are admitted in this order, as the master does it; a period is rounded down to one compatible with the
-    others. The exit code is 1 if one is refused.
+    Messages are admitted in this order, as the master does it. A period that is a whole number of slots is kept if
+    possible; else it is rounded down to one that divides the cycle, or is a multiple of it. The exit code is 1 if one
+    is refused.
     """
     plan = [parse(each) for each in messages]
     timing = grid(slots, cycle, bitrate)
-    execute(lambda: _print(plan, timing, svg, Output(format)))
+    calendar = Calendar(timing.slots, periods)
+    execute(lambda: _print(plan, calendar, timing, svg, Output(format)))
 
 
 def grid(slots: int, cycle: float | None, bitrate: int) -> Timing:
@@ -198,8 +204,7 @@ def _period(text: str) -> float:
     return seconds(text)
 
 
-async def _print(plan: list[Wanted], grid: Timing, svg: Path | None, output: Output) -> None:
-    calendar = Calendar(grid.slots)
+async def _print(plan: list[Wanted], calendar: Calendar, grid: Timing, svg: Path | None, output: Output) -> None:
     results = admit_all(calendar, plan, grid)
     rows = [_row(each, result, grid) for each, result in zip(plan, results, strict=True)]
     await output.table(rows, ["name", "bytes", "slots", "wanted_hz", "hz", "period", "phase", "in_cycle", "refused"])
@@ -208,21 +213,26 @@ async def _print(plan: list[Wanted], grid: Timing, svg: Path | None, output: Out
     if svg is not None:
         save(svg, cells, _describe(grid))
     if refused := sum(isinstance(result, Refusal) for result in results):
-        raise r2p.Error(f"{refused} of {len(plan)} messages do not fit{_hint(plan, grid)}")
+        raise r2p.Error(f"{refused} of {len(plan)} messages do not fit{_hint(plan, calendar.rule, grid)}")
 
 
 def admit_all(calendar: Calendar, plan: list[Wanted], grid: Timing) -> list[Reservation | Refusal]:
-    """Admit the messages in order; message ids are their indices."""
-    return [
-        calendar.admit(i, each.interval // grid.slot, rtcan.fragment_count(each.size), round_down=True)
-        for i, each in enumerate(plan)
-    ]
+    """Admit the messages in order, as their owners ask for slots; message ids are their indices."""
+    results = []
+    for i, each in enumerate(plan):
+        period, rest = divmod(each.interval, grid.slot)
+        fragments = rtcan.fragment_count(each.size)
+        result = calendar.admit(i, period, fragments, round_down=bool(rest))
+        if isinstance(result, Refusal) and not rest:
+            result = calendar.admit(i, period, fragments, round_down=True)
+        results.append(result)
+    return results
 
 
-def _hint(plan: list[Wanted], grid: Timing) -> str:
+def _hint(plan: list[Wanted], rule: PeriodRule, grid: Timing) -> str:
     """Suggest another order if all messages fit with the shortest periods first."""
     ordered = sorted(plan, key=lambda each: each.interval)
-    if any(isinstance(result, Refusal) for result in admit_all(Calendar(grid.slots), ordered, grid)):
+    if any(isinstance(result, Refusal) for result in admit_all(Calendar(grid.slots, rule), ordered, grid)):
         return ""
     return "; all of them fit in this order: " + " ".join(each.name for each in ordered)
 
@@ -240,22 +250,29 @@ def _row(wanted: Wanted, result: Reservation | Refusal, grid: Timing) -> Record:
         "hz": round(SECOND / (result.period * grid.slot), 3),
         "period": result.period,
         "phase": result.phase,
-        "in_cycle": result.fragments * max(1, grid.slots // result.period),
+        "in_cycle": result.fragments * -(-grid.slots // result.period),  # at most
         "refused": None,
     }
 
 
 def planned_cells(calendar: Calendar, plan: list[Wanted], grid: Timing) -> list[Cell]:
-    """Return the slots of a calendar for a drawing; a slot that is used only in some cycles has a note."""
-    cells = [Cell("sync")] + [Cell()] * (grid.slots - 1)
+    """Return the slots of a calendar for a drawing. The note of a slot says who has it in how many of the cycles."""
+    shares: list[list[tuple[int, str]]] = [[] for _ in range(grid.slots)]
     for each in calendar:
-        start = each.phase - each.phase % grid.slots
-        mask = occupied(each, start, grid.slots)
-        name, every = plan[each.message].name, max(1, each.period // grid.slots)
+        factor = math.gcd(each.period, grid.slots)
+        every = each.period // factor
         for slot in range(grid.slots):
-            if mask >> slot & 1:
-                cells[slot] = Cell(name, note=name + (f", every {every} cycles" if every > 1 else ""))
-    return cells
+            if (slot - each.phase) % factor < each.fragments:
+                shares[slot].append((every, plan[each.message].name))
+    return [Cell("sync"), *map(_planned_cell, shares[1:])]
+
+
+def _planned_cell(shares: list[tuple[int, str]]) -> Cell:
+    """Return a slot that its owners have each so many cycles; it is drawn as that of the most frequent one."""
+    if not shares:
+        return Cell()
+    notes = (name + (f", every {every} cycles" if every > 1 else "") for every, name in shares)
+    return Cell(min(shares)[1], note="; ".join(notes))
 
 
 def summary(calendar: Calendar, grid: Timing) -> str:

@@ -5,6 +5,7 @@ all nodes of its network share.
 """
 
 import asyncio
+import enum
 import importlib
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +14,7 @@ import msgspec
 
 from r2p.errors import TransportError
 from r2p.keys import SharedKey
+from r2p.protocols.rtcan.calendar import PeriodRule
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import EngineSettings, Profile
 from r2p.transports.can.port import CanPort
@@ -44,7 +46,8 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     `id`: 1 to 255; None: claim a free one. `priority`: 0 to 255, to be the master; 0: never. `slots`, `cycle` (nominal)
     and `bitrate` must be the same in the whole network. `profile`: auto, rtcan or firmware-2014. `utc`: how far the
-    module's UTC may be off, if it is known: as the master it distributes UTC. `key`: shared by those that give orders.
+    module's UTC may be off, if it is known: as the master it distributes UTC. `periods`: as the master, which ones it
+    admits together. `key`: shared by those that give orders.
     """
 
     id: int | None = None
@@ -54,6 +57,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
     bitrate: int = 1_000_000
     profile: Profile = Profile.AUTO
     utc: float | None = None
+    periods: PeriodRule = PeriodRule.COMMON_FACTORS
     key: SharedKey | None = None
 
     @property
@@ -83,6 +87,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
             receive_latency=port.receive_latency,
             transmit_latency=port.transmit_latency,
             coarse=port.coarse,
+            periods=self.periods,
             reserves=self.holds_slots_on_coarse_port or not port.coarse,
             capacity=_CAPACITY,
         )
@@ -199,11 +204,14 @@ def _bitrate(text: str) -> int:
     return value
 
 
-def _profile(text: str) -> Profile:
-    try:
-        return Profile(text)
-    except ValueError:
-        raise ValueError(f"use one of {', '.join(each.value for each in Profile)}") from None
+def _one_of(kind: type[enum.Enum]) -> Callable[[str], enum.Enum]:
+    def convert(text: str) -> enum.Enum:
+        try:
+            return kind(text)
+        except ValueError:
+            raise ValueError(f"use one of {', '.join(each.value for each in kind)}") from None
+
+    return convert
 
 
 OPTIONS: dict[str, Callable[[str], Any]] = {
@@ -212,8 +220,9 @@ OPTIONS: dict[str, Callable[[str], Any]] = {
     "slots": _int_between(2, 64),
     "cycle": duration,
     "bitrate": _bitrate,
-    "profile": _profile,
+    "profile": _one_of(Profile),
     "utc": duration,
+    "periods": _one_of(PeriodRule),
     "key": key_file,
 }
 """Converters for `Url.parsed`."""

@@ -7,7 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.codecs.management import RefuseReason
-from r2p.protocols.rtcan.calendar import PERIOD_MAX, Calendar, Refusal, Reservation, occupied
+from r2p.protocols.rtcan.calendar import PERIOD_MAX, Calendar, PeriodRule, Refusal, Reservation, occupied
+
+HARMONIC = PeriodRule.HARMONIC
 
 
 def collide(a: Reservation, b: Reservation) -> bool:
@@ -31,15 +33,19 @@ def refused(calendar: Calendar, message: int, period: int, fragments: int = 1) -
 
 def test_the_schedule_of_the_thesis() -> None:
     """Three nodes, each with messages every 6, 30 and 60 slots: 39 of 59 slots (thesis 4.4.1, figure 4.12)."""
-    calendar = Calendar(60)
+    calendar = Calendar(60, HARMONIC)
     phases = [admitted(calendar, period << 8 | node, period).phase for period in (6, 30, 60) for node in (1, 2, 3)]
     assert phases == [1, 2, 3, 4, 5, 6, 10, 11, 12]
     assert (calendar.mask(0) >> 1).bit_count() == 39
     assert calendar.mask(7) == calendar.mask(0) == 0x038E38FF_8E38FFFF  # as written down in the original's hrt.c
+    ours = Calendar(60)
+    for period in (60, 60, 60, 30, 30, 30, 6, 6, 6):  # the least phases would take all six residues of 6
+        admitted(ours, len(ours), period)
+    assert (ours.mask(0) >> 1).bit_count() == 39
 
 
 def test_the_least_phase_from_1_on() -> None:
-    calendar = Calendar(10)
+    calendar = Calendar(10, HARMONIC)
     assert [admitted(calendar, message, 10).phase for message in range(9)] == [*range(1, 10)]
     refusal = refused(calendar, 9, 10)
     assert refusal.reason == RefuseReason.FULL
@@ -49,13 +55,46 @@ def test_the_least_phase_from_1_on() -> None:
     assert admitted(calendar, 9, 10).phase == 4
 
 
+def test_the_phase_that_leaves_most() -> None:
+    calendar = Calendar(60)
+    periods = [30, *[60] * 7]  # with the sync, they are ten slots of a cycle
+    assert [admitted(calendar, message, period).phase % 6 for message, period in enumerate(periods)] == [0] * 8
+    assert sorted(admitted(calendar, message, 6).phase for message in range(11, 16)) == [1, 2, 3, 4, 5]
+
+
 def test_fragments_take_slots_in_a_row() -> None:
-    calendar = Calendar(12)
+    calendar = Calendar(12, HARMONIC)
     assert admitted(calendar, 1, 12, 3).phase == 1
     assert admitted(calendar, 2, 6, 2).phase == 4  # 4, 5 and 10, 11: not 1..3, nor 6 = 0
     assert admitted(calendar, 3, 12, 3).phase == 6
     assert refused(calendar, 4, 12, 2).reason == RefuseReason.FULL
     assert admitted(calendar, 4, 12).phase == 9
+
+
+def test_periods_with_common_factors() -> None:
+    """Thesis 4.3.4: periods must not be relatively prime; nothing says that one divides the other."""
+    calendar = Calendar(60)
+    for message, period in enumerate((8, 18, 48, 90), 1):
+        reservation = admitted(calendar, message, period)
+        assert reservation.period == period
+        assert reservation.phase % math.gcd(period, 60)
+    assert refused(calendar, 9, 35).text == (
+        "a period of 35 slots meets the 8 of message 0x0001 at each phase: their greatest common factor is 1"
+    )
+    assert refused(Calendar(60), 9, 7).text == (
+        "a period of 7 slots meets the 60 of a cycle at each phase: their greatest common factor is 1"
+    )
+    assert refused(Calendar(60), 9, 9, 3).reason == RefuseReason.FACTOR  # three and the sync in three residues
+
+
+def test_the_mask_of_each_cycle_where_periods_do_not_divide_it() -> None:
+    """A period of 90 slots comes two times in three cycles, and the counter goes on beyond what the sync has of it."""
+    calendar = Calendar(60)
+    phase = admitted(calendar, 1, 90).phase
+    for cycle in (0, 1, 2, 255, 256, 257, 1 << 40):
+        mask = sum(1 << slot for slot in range(60) if (cycle * 60 + slot - phase) % 90 == 0)
+        assert calendar.mask(cycle) == mask | 1
+    assert [(calendar.mask(cycle) >> 1).bit_count() for cycle in range(6)] == [1, 1, 0] * 2 or phase >= 30
 
 
 @pytest.mark.parametrize(
@@ -73,7 +112,7 @@ def test_fragments_take_slots_in_a_row() -> None:
     ],
 )
 def test_refusals_say_why(period: int, fragments: int, reason: RefuseReason, text: str) -> None:
-    calendar = Calendar(60)
+    calendar = Calendar(60, HARMONIC)
     admitted(calendar, 0x0102, 12)
     refusal = refused(calendar, 0x0103, period, fragments)
     assert refusal.reason == reason
@@ -89,13 +128,33 @@ def test_a_period_is_rounded_down_to_what_is_possible() -> None:
         assert isinstance(outcome, Reservation)
         periods.append(outcome.period)
     assert periods == [30, 60, 180, 6]
-    outcome = calendar.admit(9, 120, round_down=True)  # 120 does not go with 180
+    outcome = calendar.admit(9, 120, round_down=True)
+    assert isinstance(outcome, Reservation)
+    assert outcome.period == 120
+    harmonic = Calendar(60, HARMONIC)
+    admitted(harmonic, 1, 180)
+    outcome = harmonic.admit(9, 120, round_down=True)  # 120 does not go with 180
     assert isinstance(outcome, Reservation)
     assert outcome.period == 60
 
 
+def test_rounding_down_goes_on_where_nothing_is_free() -> None:
+    calendar = Calendar(4)
+    for message in range(3):  # each residue that the sync leaves, each second cycle
+        assert calendar.readmit(Reservation(message, 8, 1 + message)) == calendar.get(message)
+    assert refused(calendar, 9, 12).reason == RefuseReason.FULL
+    outcome = calendar.admit(9, 12, round_down=True)
+    assert isinstance(outcome, Reservation)
+    assert (outcome.period, outcome.phase) == (8, 5)
+    for message in range(3):
+        calendar.admit(20 + message, 8)
+    outcome = calendar.admit(99, 100, round_down=True)
+    assert isinstance(outcome, Refusal)
+    assert (outcome.reason, outcome.period) == (RefuseReason.FULL, 100)
+
+
 def test_asking_again_changes_nothing_and_asking_for_something_else_gives_the_old_slots_back() -> None:
-    calendar = Calendar(10)
+    calendar = Calendar(10, HARMONIC)
     first = admitted(calendar, 1, 10)
     admitted(calendar, 2, 10)
     assert calendar.admit(1, 10) == first
@@ -129,7 +188,7 @@ def test_what_another_master_granted() -> None:
 
 
 def test_periods_of_several_cycles() -> None:
-    calendar = Calendar(4)
+    calendar = Calendar(4, HARMONIC)
     assert [admitted(calendar, message, 12).phase for message in range(9)] == [1, 2, 3, 5, 6, 7, 9, 10, 11]
     assert refused(calendar, 9, 4).reason == RefuseReason.FULL
     for message in (0, 3, 6):
@@ -155,21 +214,28 @@ requests = st.lists(
 )
 
 
-@given(st.integers(2, 64), requests)
-def test_no_slot_ever_has_two_owners(slots: int, changes: list[object]) -> None:
-    calendar = Calendar(slots)
+def apply(calendar: Calendar, change: object) -> None:
+    """Change the calendar. Its answer is about the very period that was asked for, unless a shorter one will do."""
+    match change:
+        case int(message):
+            calendar.remove(message)
+        case (int(message), int(factor), int(fragments), None):
+            period = factor * calendar.slots
+            assert calendar.admit(message, period, fragments).period == period
+        case (int(message), int(period), int(fragments), bool(round_down)):
+            answer = calendar.admit(message, period, fragments, round_down=round_down)
+            assert answer.period == period or (round_down and answer.period < period)
+        case Reservation():
+            calendar.readmit(change)
+        case _:
+            raise AssertionError(change)
+
+
+@given(st.integers(2, 64), requests, st.sampled_from(PeriodRule))
+def test_no_slot_ever_has_two_owners(slots: int, changes: list[object], rule: PeriodRule) -> None:
+    calendar = Calendar(slots, rule)
     for change in changes:
-        match change:
-            case int(message):
-                calendar.remove(message)
-            case (int(message), int(factor), int(fragments), None):
-                calendar.admit(message, factor * slots, fragments)
-            case (int(message), int(period), int(fragments), bool(round_down)):
-                calendar.admit(message, period, fragments, round_down=round_down)
-            case Reservation():
-                calendar.readmit(change)
-            case _:
-                raise AssertionError(change)
+        apply(calendar, change)
         all_of_them = [*calendar, Reservation(-1, slots, 0)]
         assert not any(collide(a, b) for i, a in enumerate(all_of_them) for b in all_of_them[:i])
     all_of_them = [*calendar, Reservation(-1, slots, 0)]
@@ -197,11 +263,11 @@ def test_collide_is_what_it_says(p: int, f: int, k: int, q: int, g: int, n: int)
 @given(st.integers(2, 64), st.data())
 def test_nothing_is_refused_that_would_fit_at_some_phase(slots: int, data: st.DataObject) -> None:
     calendar = Calendar(slots)
-    divisors = [divisor for divisor in range(2, slots + 1) if slots % divisor == 0]
+    factors = [period for period in range(2, 2 * slots + 1) if math.gcd(slots, period) > 1]
     for message in range(data.draw(st.integers(0, 12))):
-        period = data.draw(st.sampled_from(divisors))
-        outcome = calendar.admit(message, period, data.draw(st.integers(1, 3)))
-        if isinstance(outcome, Refusal) and outcome.reason == RefuseReason.FULL:
+        period = data.draw(st.sampled_from(factors))
+        outcome = calendar.admit(message, period, data.draw(st.integers(1, min(3, period - 1))))
+        if isinstance(outcome, Refusal):
             others = [*calendar, Reservation(-1, slots, 0)]
             for phase in range(period):
                 candidate = Reservation(99, period, phase, outcome.fragments)

@@ -1,12 +1,14 @@
 """Hard real-time messages: slots of their own, on lease, and what becomes of them."""
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import Grant, RefuseReason, Renew, Renewed, Reserve
-from r2p.protocols.rtcan.calendar import Reservation
+from r2p.protocols.rtcan.calendar import PeriodRule, Reservation, occupied
 from r2p.protocols.rtcan.cycle import timing
 from r2p.protocols.rtcan.events import (
     Done,
@@ -34,14 +36,15 @@ def test_a_periodic_message_owns_its_slots(size: int, lead: int) -> None:
     listener.engine.subscribe(rtcan.message_id(TOPIC, 11), size)
     owner.act(owner.engine.reserve(owner.now, TOPIC, size, 5 * MS, lead=lead, handle="hrt"))
     bus.run(20 * MS)
-    granted = owner.of(SlotsGranted)
-    assert granted == [SlotsGranted(TOPIC, 30, 1, 30 * SLOT)]
+    (granted,) = owner.of(SlotsGranted)
+    phase = granted.phase
+    assert granted == SlotsGranted(TOPIC, 30, phase, 30 * SLOT)
     begin = bus.now
     bus.run(SECOND)
     fragments = rtcan.fragment_count(size)
     at = [start for start in starts(bus, TOPIC, 0) if start > begin]
     reference = syncs(bus, begin)[0][0]
-    assert {(start - reference) % (30 * SLOT) for start in at} == {SLOT * (1 + n) for n in range(fragments)}
+    assert {(start - reference) % (30 * SLOT) for start in at} == {SLOT * (phase + n) for n in range(fragments)}
     assert abs(len(at) - fragments * SECOND // (30 * SLOT)) <= fragments
     got = listener.received(TOPIC)
     assert got == sorted(got, key=filled.index)  # never an old one after a newer one
@@ -53,14 +56,14 @@ def test_a_periodic_message_owns_its_slots(size: int, lead: int) -> None:
 
 def test_the_master_has_slots_too_and_none_is_given_twice() -> None:
     bus = Bus()
-    nodes = network(bus, 1, 0, 0)
+    nodes = network(bus, 1, 0, 0, periods=PeriodRule.HARMONIC)
     for high, period in ((2, MS), (3, 5 * MS), (4, 10 * MS)):
         for node in nodes:
             counted(node)
             node.act(node.engine.reserve(node.now, high, 8, period))
         bus.run(100 * MS)
     phases = sorted((g.period, g.phase) for node in nodes for g in node.of(SlotsGranted))
-    assert phases == [(6, 1), (6, 2), (6, 3), (30, 4), (30, 5), (30, 6), (60, 10), (60, 11), (60, 12)]
+    assert phases == [(6, 1), (6, 2), (6, 3), (30, 4), (30, 5), (30, 6), (60, 10), (60, 11), (60, 12)]  # thesis 4.4.1
     begin = bus.now
     bus.run(20 * CYCLE)
     hrt = [at for at, frame, _ in bus.sent if frame.id >> 23 == 0 and at > begin and not is_sync(frame)]
@@ -138,7 +141,8 @@ def test_slots_are_given_back() -> None:
     counted(owner)
     owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 10 * MS))
     bus.run(100 * MS)
-    assert master.engine.cycle.mask == 0b11
+    (granted,) = owner.of(SlotsGranted)
+    assert master.engine.cycle.mask == 1 | 1 << granted.phase
     owner.act(owner.engine.release(owner.now, TOPIC))
     bus.run(30 * MS)
     assert master.engine.cycle.mask == 0b1
@@ -151,13 +155,14 @@ def test_the_slots_of_a_dead_node_come_free_after_3_s() -> None:
     counted(owner)
     owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 10 * MS))
     bus.run(10 * SECOND)
-    assert master.engine.cycle.mask == 0b11  # renewed and renewed
+    (granted,) = owner.of(SlotsGranted)
+    assert master.engine.cycle.mask == 1 | 1 << granted.phase  # renewed and renewed
     assert owner.of(SlotsLost) == []
     bus.kill(owner)
     other = bus.add(id8=12)  # another node must acknowledge
     bus.start(other)
     bus.run(SECOND)
-    assert master.engine.cycle.mask == 0b11
+    assert master.engine.cycle.mask == 1 | 1 << granted.phase
     bus.run(2100 * MS)
     assert master.engine.cycle.mask == 0b1
 
@@ -179,22 +184,21 @@ def test_the_owner_stops_when_the_master_does_not_answer() -> None:
     assert starts(bus, TOPIC, 0)[-1] > bus.now - 2 * CYCLE
 
 
-SLOTS = CYCLE // SLOT
 periodics = st.lists(
     st.builds(
-        lambda cycles, phase, fragments, lead, begins: PeriodicMessage(
+        lambda period, phase, fragments, lead, begins: PeriodicMessage(
             TOPIC,
             0x2105,
             8 * fragments,
             fragments,
-            cycles * CYCLE,
+            period * SLOT,
             lead * SLOT,
             None,
-            reservation=Reservation(0x2105, cycles * SLOTS, 1 + phase, fragments),
+            reservation=Reservation(0x2105, period, 1 + phase, fragments),
             active=True,
             from_cycle=begins,
         ),
-        st.sampled_from([1, 2, 4, 12]),
+        st.sampled_from([60, 120, 240, 720, 90, 36, 48, 3570]),  # with all of them, the plan repeats after 4 284 cycles
         st.integers(0, 50),
         st.integers(1, 3),
         st.integers(0, 100),
@@ -268,6 +272,63 @@ def test_a_mask_that_stays_without_our_slots_is_believed() -> None:
     bus.run(20 * CYCLE)
     assert owner.engine.counts["masks doubted"] == 3
     assert owner.engine.counts["hrt not in the mask"] > 0
+
+
+def test_plans_that_never_repeat_are_not_all_kept() -> None:
+    plan = SlotPlan(timing())
+    owned = Reservation(MESSAGE, 59 * 64 * 6, 1)  # it repeats after 3 776 cycles
+    plan.periodics[TOPIC] = PeriodicMessage(TOPIC, MESSAGE, 8, 1, MS, 0, None, reservation=owned, active=True)
+    used = 0
+    for cycle in range(3776):
+        plan.begin_cycle(cycle)
+        used += plan.own.bit_count()
+        assert plan.own == occupied(owned, cycle * 60, 60)
+        assert len(plan._cycles) <= 256
+    assert used == 3776 * 60 // owned.period
+
+
+def test_a_period_that_does_not_divide_the_cycle_is_kept_with_the_whole_counter() -> None:
+    """90 slots: two messages in three cycles, also for a node that joins when the sync's counter has wrapped."""
+    bus = Bus()
+    _master, owner, listener = network(bus, 1, 0, 0)
+    late = bus.add(id8=20)
+    counted(owner)
+    counted(late)
+    listener.engine.subscribe(rtcan.message_id(TOPIC, 11), 8)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 90 * SLOT, handle="hrt"))
+    bus.run(4 * SECOND)  # over 256 cycles
+    bus.start(late)
+    bus.run(2 * SECOND)
+    late.act(late.engine.reserve(late.now, 6, 8, 48 * SLOT, handle="hrt"))
+    bus.run(SECOND)
+    begin = bus.now
+    bus.run(6 * SECOND)
+    assert [(granted.period, granted.interval) for granted in owner.of(SlotsGranted)] == [(90, 90 * SLOT)]
+    assert [granted.period for granted in late.of(SlotsGranted)] == [48]
+    for node, high, period in ((owner, TOPIC, 90), (late, 6, 48)):
+        at = [start for start in starts(bus, high, 0) if start > begin]
+        assert len(at) == pytest.approx(6 * SECOND / (period * SLOT), abs=1)
+        assert {b - a for a, b in pairwise(at)} == {period * SLOT}
+        assert node.engine.counts["missed"] <= 1  # what waited when it got the slots
+
+
+def test_a_period_that_is_impossible_as_it_is_is_rounded_down_at_once() -> None:
+    bus = Bus()
+    _master, owner = network(bus, 1, 0)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 61 * SLOT))  # it has no factor in common with 60
+    bus.run(100 * MS)
+    assert [granted.period for granted in owner.of(SlotsGranted)] == [60]
+    assert owner.of(SlotsRefused) == []
+
+
+def test_a_master_that_keeps_the_harmonic_rule_rounds_down() -> None:
+    bus = Bus()
+    _master, owner = network(bus, 1, 0, periods=PeriodRule.HARMONIC)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 90 * SLOT))
+    bus.run(100 * MS)
+    assert [(granted.period, granted.phase) for granted in owner.of(SlotsGranted)] == [(60, 1)]
 
 
 # Answers of the master that come late, or out of order

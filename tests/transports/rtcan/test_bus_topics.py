@@ -94,7 +94,7 @@ async def test_error_frames_are_counted() -> None:
     async with lab("MOTOR", "EYE") as (bus, nodes), encoder(bus, nodes):
         samples = nodes[0].subscribe("bus_load", BusTraffic, queue=100).samples()
         assert (await second_of(samples))[0].message.errors == 0
-        bus.can.bus.noise = 0.2
+        bus.can.bus.noise = 0.1
         rows = await second_of(samples)
         end = period_end(rows[0])
         failed = [each for each in bus.frames if each.error is not None and end - SECOND <= each.end < end]
@@ -119,6 +119,7 @@ async def test_without_a_subscriber_nothing_is_advertised_and_frames_are_filtere
     async with lab("MOTOR", "EYE") as (bus, nodes), encoder(bus, nodes):
         port = bus.link("EYE").driver.port  # of both, the first by name publishes
         assert isinstance(port, SimPort)
+        await asyncio.sleep(1.0)  # both have found each other
         filters = port.controller.filters
         subscriber = nodes[0].subscribe("bus_load", BusTraffic)
         await second_of(subscriber.samples())
