@@ -204,6 +204,9 @@ class Alarm:
         self._background = background
         self._clock = clock_of(loop)
         self._callback = callback
+        self._call_at_instant: Callable[[int, Callable[[], object]], Any] | None = None
+        if self._clock.virtual:  # the instant itself: a sum of floats may miss it by a nanosecond
+            self._call_at_instant = getattr(loop, "call_at_instant", None)
         self._deadline: int | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._armed: int | None = None  # when the loop calls; earlier than the deadline, if that was put off
@@ -224,11 +227,12 @@ class Alarm:
 
     def _arm(self, deadline: int, delay: int) -> None:
         self._armed = deadline
-        if self._clock.virtual:  # the instant itself: a sum of floats may miss it by a nanosecond
-            outer = REAL_TIME.set(False)  # whichever code moves it, and for what it calls
-            self._timer = self._loop.call_at(deadline / SECOND, self._fire)
-            REAL_TIME.reset(outer)
-            in_background(self._timer, self._background)
+        if self._call_at_instant is not None:
+            outer = REAL_TIME.set(False) if REAL_TIME.get() else None  # whichever code moves it, and for what it calls
+            self._timer = timer = self._call_at_instant(deadline, self._fire)
+            timer.background = self._background
+            if outer is not None:
+                REAL_TIME.reset(outer)
         else:
             self._timer = self._loop.call_later(delay / SECOND, self._fire)
 

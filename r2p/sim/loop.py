@@ -20,7 +20,7 @@ import itertools
 import random
 import selectors
 from collections.abc import Callable, Coroutine
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar, TypeVarTuple, Unpack
 
@@ -40,13 +40,13 @@ Ts = TypeVarTuple("Ts")
 
 _HORIZON: Final = float(2**22)  # seconds, 48 days: up to here there are two floats for each nanosecond
 _END: Final = 2**22 * SECOND  # the same in ns
-_RESOLUTION: Final = 0.4e-9  # seconds: less than a nanosecond, and more than the rounding error at the horizon
 _IDLE_MIN: Final = 20 * SECOND  # of virtual time with nothing but background timers, before a Deadlock...
 _IDLE_REAL_MIN: Final = SECOND // 2  # ... which also takes this much real time...
 _IDLE_MAX: Final = 300 * SECOND  # ... but never more virtual time than this
 _IDLE_CHECK: Final = 5 * SECOND  # between two checks whether a task has been woken
 _BUSY: Final = 100_000  # iterations of the loop at one instant, after which the next timer runs anyway
 _AHEAD: Final = 1000  # events in one iteration of the loop: signals and real file descriptors wait for so long
+_CANCELLED_MIN: Final = 50  # cancelled timers behind others are dropped when there are more, and half are
 _POLL_EVERY: Final = 64  # iterations between two polls of asyncio's own descriptor, which signals wake
 _SHORTEST_WAIT: Final = 0.001  # s: a real timer may ask for virtual time that stands still
 _LONGEST_WAIT: Final = 3600.0  # s: no poll takes much longer ones
@@ -104,26 +104,29 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     """An asyncio event loop under virtual time. `r2p.clock` uses its `clock` and `random`."""
 
     _ready: deque[asyncio.Handle]  # what asyncio will call next
-    _scheduled: list[asyncio.TimerHandle]  # asyncio's heap of timers; when it polls, the first one is not cancelled
-    _clock_resolution: float  # asyncio runs timers that are due this much later, too
+    _stopping: bool  # whether asyncio is to return from `run_forever`
+    _selector: _Selector
+    _timer_cancelled_count: int  # asyncio counts cancelled timers that are still in the heap
+    _process_events: Callable[[list[Any]], None]
 
     def __init__(self, *, seed: int = 0, limit: float | None = None, clock: VirtualClock | None = None) -> None:
         self.clock = VirtualClock() if clock is None else clock
         super().__init__(_Selector(self._idle, self._turn, self._advance if self.clock.paced else None))
-        self._end = _HORIZON if limit is None else min(limit, _HORIZON)  # s
+        self._end = _END if limit is None else min(_nanoseconds(min(limit, _HORIZON)), _END)
         self._checked = 0  # ns: the last check for tasks that were woken, or the last timer not in the background
         self._waited_for: dict[asyncio.Task[Any], object] | None = None  # what each task waited for at that check
         self._alive = self._alive_really = 0  # ns: since when no task has been woken; the same in real time
         self.random = random.Random(seed)
         self.task_numbers = itertools.count(1)
         self._timer_numbers = itertools.count()
-        self._real_timers: list[_VirtualTimer] = []
-        """Timers in real time, of a paced clock."""
+        self._timers: list[tuple[int, int, _VirtualTimer]] = []
+        """A heap of timers by their instant (ns) and number: tuples are compared without a call."""
+        self._real_timers: list[tuple[float, int, _VirtualTimer]] = []
+        """Timers in real time (s), of a paced clock."""
         self._jobs = 0
         self._limit = 0  # ns; up to here, not including, `run_ahead` may go
         self._turns = 0
         self._instant = 0
-        self._clock_resolution = _RESOLUTION
         self.set_task_factory(_Task.make)
 
     def time(self) -> float:
@@ -145,29 +148,33 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             raise RuntimeError("Event loop is closed")
         if self.clock.paced and REAL_TIME.get():
             return self._call_at_real(max(when - self.time(), _SHORTEST_WAIT), callback, args, context)
-        if when < _HORIZON:
-            instant = _nanoseconds(when)
-            when = instant / SECOND
-            if instant < self._limit:
-                self._limit = instant
-        timer = _VirtualTimer(when, next(self._timer_numbers), callback, args, self, context)
-        heappush(self._scheduled, timer)
+        return self.call_at_instant(_nanoseconds(when) if when < _HORIZON else _END, callback, *args, context=context)
+
+    def call_at_instant(
+        self, instant: int, callback: Callable[..., object], *args: Any, context: contextvars.Context | None = None
+    ) -> _VirtualTimer:
+        """Do the same as `call_at`, in ns since the start, and always in virtual time: for `r2p.clock`."""
+        if instant < self._limit:
+            self._limit = instant
+        number = next(self._timer_numbers)
+        timer = _VirtualTimer(instant / SECOND, callback, args, self, context)
+        heappush(self._timers, (instant, number, timer))
         return timer
 
     def _call_at_real(
         self, delay: float, callback: Any, args: Any, context: contextvars.Context | None
     ) -> asyncio.TimerHandle:
         when = _REAL.monotonic() / SECOND + delay
-        timer = _VirtualTimer(when, next(self._timer_numbers), callback, args, self, context)
+        timer = _VirtualTimer(when, callback, args, self, context)
         timer._scheduled = False  # noqa: SLF001 - in the heap of virtual timers, as far as asyncio cares
-        heappush(self._real_timers, timer)
+        heappush(self._real_timers, (when, next(self._timer_numbers), timer))
         return timer
 
     def _run_real_timers(self) -> None:
         """Call the real timers that are due."""
         now = _REAL.monotonic() / SECOND
-        while self._real_timers and (self._real_timers[0].when() <= now or self._real_timers[0].cancelled()):
-            timer = heappop(self._real_timers)
+        while self._real_timers and (self._real_timers[0][0] <= now or self._real_timers[0][2].cancelled()):
+            timer = heappop(self._real_timers)[2]
             if not timer.cancelled():
                 self._ready.append(timer)
 
@@ -175,7 +182,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """Return the real seconds until the next real timer."""
         if not self._real_timers:
             return _LONGEST_WAIT
-        return max(0.0, self._real_timers[0].when() - _REAL.monotonic() / SECOND)
+        return max(0.0, self._real_timers[0][0] - _REAL.monotonic() / SECOND)
 
     def run_in_executor(
         self, executor: Executor | None, func: Callable[[Unpack[Ts]], T], *args: *Ts
@@ -217,8 +224,43 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             del events[0]
             callback(*args)
 
+    def close(self) -> None:
+        """Do as asyncio."""
+        super().close()
+        self._timers.clear()
+
+    def _run_once(self) -> None:
+        """Do one iteration as asyncio does, but with integers: between the events of a simulation, this is hot."""
+        timers, ready = self._timers, self._ready
+        if self._timer_cancelled_count:
+            self._drop_cancelled()
+        at_once = ready or self._stopping or (timers and timers[0][0] <= self.clock.elapsed)
+        events = self._selector.select(0 if at_once else None)
+        if events:
+            self._process_events(events)
+        elapsed = self.clock.elapsed
+        while timers and timers[0][0] <= elapsed:
+            timer = heappop(timers)[2]
+            timer._scheduled = False  # noqa: SLF001 - asyncio's
+            ready.append(timer)
+        for _ in range(len(ready)):  # not what these add: that comes after the next look at timers and descriptors
+            handle = ready.popleft()
+            if not handle._cancelled:  # noqa: SLF001
+                handle._run()  # noqa: SLF001
+
+    def _drop_cancelled(self) -> None:
+        """Drop cancelled timers at the head of the heap, or all if they are too many."""
+        timers = self._timers
+        if self._timer_cancelled_count > max(_CANCELLED_MIN, len(timers) // 2):
+            timers[:] = [each for each in timers if not each[2].cancelled()]
+            heapify(timers)
+            self._timer_cancelled_count = 0
+        while timers and timers[0][2].cancelled():
+            heappop(timers)
+            self._timer_cancelled_count -= 1
+
     def _next_timer(self) -> int:
-        return _nanoseconds(min(self._scheduled[0].when(), _HORIZON)) if self._scheduled else _END
+        return self._timers[0][0] if self._timers else _END
 
     def _job_done(self, _future: asyncio.Future[Any]) -> None:
         self._jobs -= 1
@@ -228,14 +270,14 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         if self._instant != self.clock.elapsed:
             self._instant, self._turns = self.clock.elapsed, 0
         self._turns += 1
-        if self._turns >= _BUSY and self._scheduled and not self._jobs and not self.clock.paced:
-            when = self._scheduled[0].when()
-            if when < _HORIZON:
-                self.clock.elapsed = max(self.clock.elapsed, _nanoseconds(when))
+        if self._turns >= _BUSY and not self._jobs and not self.clock.paced:
+            instant = self._next_timer()
+            if instant < _END:
+                self.clock.elapsed = max(self.clock.elapsed, instant)
 
     def _advance(self) -> None:
         """Let the time of a paced clock pass, up to the next timer."""
-        self.clock.advance(min(self._next_timer(), _nanoseconds(self._end)))
+        self.clock.advance(min(self._next_timer(), self._end))
         self._run_real_timers()
 
     def _idle(self) -> float | None:
@@ -247,11 +289,10 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             return self._paced_idle()
         if self._jobs:
             return None
-        timer = self._scheduled[0] if self._scheduled else None
-        if timer is None or timer.when() >= self._end:
-            self._give_up(timer is not None)
-        instant = _nanoseconds(timer.when())
-        background = getattr(timer, "background", False)
+        instant = self._next_timer()
+        if instant >= self._end:
+            self._give_up(bool(self._timers))
+        background = self._timers[0][2].background
         if background is False or (background is not True and not background()):
             self._checked, self._waited_for = instant, None
         elif instant - self._checked >= _IDLE_CHECK:
@@ -261,7 +302,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
     def _paced_idle(self) -> float:
         self._advance()
-        instant, end = self._next_timer(), _nanoseconds(self._end)
+        instant, end = self._next_timer(), self._end
         if self.clock.elapsed >= end:
             self._give_up(True)
         if instant <= self.clock.elapsed or self._ready:
@@ -271,19 +312,19 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _give_up(self, later: bool) -> NoReturn:
         if not later:
             raise Deadlock(self._with_tasks("virtual time stands still: nothing is scheduled that could wake a task"))
-        if self._end == _HORIZON:
+        if self._end == _END:
             raise Deadlock(
                 self._with_tasks("virtual time is over: the next timer is more than 48 days after the start")
             )
-        text = f"virtual time is over: its limit of {self._end:g} s is reached"
-        self._end = min(self._end + _IDLE_MAX / SECOND, _HORIZON)  # for clean-up
+        text = f"virtual time is over: its limit of {self._end / SECOND:g} s is reached"
+        self._end = min(self._end + _IDLE_MAX, _END)  # for clean-up
         raise Deadlock(self._with_tasks(text))
 
     def _check_progress(self, instant: int) -> None:
         """Raise Deadlock if background timers, which alone have run for a while, have woken no task for too long."""
         before, waits = self._waited_for, {task: _future_of(task) for task in asyncio.all_tasks(self)}
         self._checked, self._waited_for = instant, waits
-        if before is None or not _same(before, waits) or not all(_in_background(timer) for timer in self._scheduled):
+        if before is None or not _same(before, waits) or not all(_in_background(each[2]) for each in self._timers):
             self._alive, self._alive_really = instant, _REAL.monotonic()
         elif instant - self._alive >= _IDLE_MAX or (
             instant - self._alive >= _IDLE_MIN and _REAL.monotonic() - self._alive_really >= _IDLE_REAL_MIN
@@ -306,9 +347,9 @@ def _same(before: dict[asyncio.Task[Any], object], now: dict[asyncio.Task[Any], 
     return before.keys() == now.keys() and all(before[task] is waits for task, waits in now.items())
 
 
-def _in_background(timer: asyncio.TimerHandle) -> bool:
+def _in_background(timer: _VirtualTimer) -> bool:
     """Return whether a timer only repeats itself, or is cancelled."""
-    background = getattr(timer, "background", False)
+    background = timer.background
     return bool(background() if callable(background) else background)
 
 
@@ -323,12 +364,23 @@ class _Selector(selectors.DefaultSelector):
         self._turn = turn
         self._advance = advance
         self._selects = itertools.count()
+        self._descriptors = 0
+
+    def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
+        key = super().register(fileobj, events, data)
+        self._descriptors = len(self.get_map())
+        return key
+
+    def unregister(self, fileobj: Any) -> selectors.SelectorKey:
+        key = super().unregister(fileobj)
+        self._descriptors = len(self.get_map())
+        return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         if self._advance is not None:
             return self._select_paced(timeout, self._advance)
         # A system call for each iteration would take most of the time; alone, asyncio's own descriptor can wait.
-        if len(self.get_map()) > 1 or not next(self._selects) % _POLL_EVERY:
+        if self._descriptors > 1 or not next(self._selects) % _POLL_EVERY:
             events = super().select(0)
             if events:
                 self._turn()
@@ -348,11 +400,12 @@ class _Selector(selectors.DefaultSelector):
 
 
 class _VirtualTimer(asyncio.TimerHandle):
-    """A timer that keeps its place behind earlier ones of the same instant: a heap alone does not."""
+    """A timer of virtual time, or of real time beside it."""
 
-    def __init__(self, when: float, number: int, callback: Any, args: Any, loop: VirtualLoop, context: Any) -> None:
+    _cancelled: bool
+
+    def __init__(self, when: float, callback: Any, args: Any, loop: VirtualLoop, context: Any) -> None:
         super().__init__(when, callback, args, loop, context)
-        self.order = (when, number)
         self.background: bool | Callable[[], bool] = False
         """True for a timer that does not keep the loop alive; set by `r2p.clock.in_background`."""
         self._scheduled = True  # asyncio's mark for timers in its heap
@@ -361,9 +414,6 @@ class _VirtualTimer(asyncio.TimerHandle):
         """Do as asyncio: a cancelled timer stays in the heap, but does not keep the program alive."""
         super().cancel()
         self.background = True
-
-    def __lt__(self, other: object) -> bool:
-        return isinstance(other, _VirtualTimer) and self.order < other.order
 
 
 class _Task(asyncio.Task[Any]):

@@ -28,7 +28,7 @@ from r2p.codecs.can_bits import EXTENDED, REMOTE, AnyFrame
 from r2p.errors import TransportError
 from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, Latency
-from r2p.sim.can.controller import ignore
+from r2p.sim.can.interrupts import ignore
 from r2p.sim.clocks import VirtualClock
 from r2p.sim.loop import VirtualLoop
 from r2p.transports.can.port import CanPort, CanPortListener, PortAlarm

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from r2p.codecs.can_bits import AnyFrame
 from r2p.sim.buses.attachment import AttachmentOptions, BusFilter, BusFrame
 from r2p.sim.can import BusError, CanController, CanNode, ControllerState, ErrorKind
-from r2p.sim.can.controller import ignore
+from r2p.sim.can.interrupts import ignore
 from r2p.sim.transport import PluggedNode, SimCan
 from r2p.units import SECOND
 

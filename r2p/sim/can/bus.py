@@ -25,7 +25,7 @@ from r2p.codecs.can_bits import (
     wire_bits,
     wire_identifier,
 )
-from r2p.sim.can.controller import RECESSIVE_BITS, BusWire, CanController, ignore
+from r2p.sim.can.controller import RECESSIVE_BITS, BusWire, CanController
 from r2p.sim.can.error_frames import (
     DELIMITER,
     FLAG,
@@ -36,6 +36,7 @@ from r2p.sim.can.error_frames import (
     first_difference,
     flip,
 )
+from r2p.sim.can.interrupts import Reception, ignore
 from r2p.sim.can.participants import Listeners, Recovery
 from r2p.sim.can.records import ArbitrationLoss, BusError, CanNode, ControllerState, ErrorKind, FrameRecord, Statistics
 from r2p.sim.can.timeline import Timeline
@@ -363,9 +364,10 @@ class CanBus(BusWire):
         frame, receivers, silent = transfer.frame, transfer.receivers, transfer.silent
         for request in transfer.requests:
             request.owner.complete(request, end)
+        reception = Reception(self.timeline, frame, end)
         for node in self._listeners.concerned[frame.id if frame.__class__ is Frame else ~wire_identifier(frame)]:
             if node in receivers or (silent and node in silent):
-                node.receive(frame, end)
+                node.receive(reception)
         self._over(transfer, transfer.bits, None, end)
 
     def _over(self, transfer: _Transfer, bits: int, error: ErrorKind | None, end: int) -> None:
@@ -473,9 +475,10 @@ class CanBus(BusWire):
 
     def _overhear(self, transfer: _Transfer) -> None:
         """Let controllers that only listen receive a frame that nobody acknowledged, as the error flag is invisible."""
+        reception = Reception(self.timeline, transfer.frame, self.timeline.now())
         for node in transfer.silent:
             if node.concerned(wire_identifier(transfer.frame)):
-                node.receive(transfer.frame, self.timeline.now())
+                node.receive(reception)
 
     def _failed(self, transfer: _Transfer, error: ErrorFrame) -> None:
         now = self.timeline.now()

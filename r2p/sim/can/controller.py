@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import msgspec
 
 from r2p.codecs.can_bits import FRAME_MAX, IDENTIFIER_BITS, Frame, arbitration_field, check_frame, wire_identifier
+from r2p.sim.can.interrupts import Interrupts, Reception, ignore
 from r2p.sim.can.records import ControllerState, ErrorKind
 from r2p.sim.can.timeline import LocalAlarm, LocalClock
 from r2p.units import NEVER
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from r2p.codecs.can_bits import AnyFrame, OtherFrame
-    from r2p.sim.can.records import BusError, CanNode, Latency
+    from r2p.sim.can.records import BusError, CanNode
     from r2p.sim.can.timeline import Timeline, TimelineTimer
 
 _BABBLE: Final = -1
@@ -253,12 +254,13 @@ class CanController:
         """Return whether a good frame of another node matters: it passes the filters, or decrements the error count."""
         return self.confinement.receive > 0 or self._is_wanted(identifier)
 
-    def receive(self, frame: AnyFrame, end: int) -> None:
+    def receive(self, reception: Reception) -> None:
         """Receive a good frame of another node that concerns this one."""
         if self.confinement.receive:
+            reception.part()  # the interrupt for a new error state comes first
             self.confinement.count_received()
             self._bus.forget_filters()
-            if not self._is_wanted(wire_identifier(frame)):
+            if not self._is_wanted(wire_identifier(reception.frame)):
                 return
         if self._lose_next:
             self._lose_next -= 1
@@ -266,7 +268,9 @@ class CanController:
         elif self.node.loss and self.numbers.random() < self.node.loss:
             self.missed += 1
         else:
-            self._interrupts.deliver(end, self.on_receive if frame.__class__ is Frame else self.on_other, frame)
+            handler = self.on_receive if reception.frame.__class__ is Frame else self.on_other
+            if handler is not ignore:
+                reception.add(self._interrupts, handler)
 
     def complete(self, request: TransmitRequest, end: int) -> None:
         """Complete this request: its frame was acknowledged."""
@@ -503,46 +507,3 @@ class ControllerMailboxes:
             return False
         del self.requests[mailbox]
         return True
-
-
-class Interrupts:
-    """Calls the callbacks of the node's software, each with the time of the node's clock as its last argument.
-
-    They come a little late, in the order of the events, and never after the node has lost power. `latency` is from an
-    event to the moment when its interrupt is served.
-    """
-
-    def __init__(self, timeline: Timeline, clock: LocalClock, latency: Latency, numbers: random.Random) -> None:
-        self._timeline = timeline
-        self._clock = clock
-        self._nominal = latency.nominal
-        self._delay = latency.sampler(numbers)
-        self._life = 0  # counts power cuts: interrupts from before one are not served
-        self._latest = 0  # when the last interrupt so far is served: none overtakes another, whatever their delays
-
-    def deliver(self, when: int, handler: Callable[..., object], *args: Any) -> None:
-        """Call the handler for an event on the bus at `when`."""
-        if handler is ignore:
-            return
-        at = when + (self._delay() if self._delay else self._nominal)
-        if at < self._latest:
-            at = self._latest
-        self._latest = at
-        self._timeline.at(at, self._serve, at, self._life, handler, args)
-
-    def check_at(self, when: int, handler: Callable[..., object], *args: Any) -> None:
-        """Call the handler for a time-out at `when`, which does not hold up the events after it."""
-        at = when + (self._delay() if self._delay else self._nominal)
-        self._timeline.at(at, self._serve, at, self._life, handler, args)
-
-    def discard(self) -> None:
-        """Drop all interrupts that were not served: the node has lost power."""
-        self._life += 1
-
-    def _serve(self, at: int, life: int, handler: Callable[..., object], args: tuple[Any, ...]) -> None:
-        if life == self._life:
-            handler(*args, self._clock.local(at))
-
-
-def ignore(*_args: object) -> None:
-    """Do nothing: the callback of software that has set none."""

@@ -83,7 +83,11 @@ class EngineDriver:
 
     def on_frame(self, frame: Frame, stamp: int) -> None:
         try:
-            self.carry_out(self.engine.receive(self.now(), frame, stamp))
+            actions = self.engine.receive(self.now(), frame, stamp)
+            if actions or self._drained is not None:
+                self.carry_out(actions)
+            else:  # most frames
+                self._timer.set(self.engine.next_deadline())
             if self._monitor is not None:
                 self._monitor.frame(frame, stamp - self.port.receive_latency)
         except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
