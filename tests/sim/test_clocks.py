@@ -72,8 +72,9 @@ def test_timers_and_jobs_in_threads() -> None:
         due: list[float] = []
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(asyncio.to_thread(socket.gethostname))
+            start = loop.time()  # not 0: time goes on while the loop is made
             for delay in (30.0, 10.0, 20.0):
-                loop.call_at(delay, lambda: due.append(loop.time()))
+                loop.call_at(start + delay, lambda: due.append(round(loop.time() - start, 6)))
             tasks.create_task(asyncio.sleep(35.0))
         return due
 
