@@ -135,7 +135,7 @@ def _sum(plan: Plan, results: Sequence[dict[str, Any]]) -> Outcome:
     added = {name: sum(each[name] for each in results) for name in results[0] if name != "latencies"}
     latencies = list(itertools.chain.from_iterable(each["latencies"] for each in results))
     topics = plan.topics
-    expected = sum(int(SECONDS / topics[name].period) - 1 for node in plan.nodes for name in node.subscribes)
+    expected = sum(int(SECONDS / topics[name].period) for node in plan.nodes for name in node.subscribes)
     return Outcome(expected=expected, latencies=latencies, **added)
 
 
