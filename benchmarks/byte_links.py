@@ -7,6 +7,7 @@ bare callbacks are what a program without asyncio gets of it.
 
 import asyncio
 import contextlib
+import functools
 import os
 import struct
 import threading
@@ -35,13 +36,15 @@ LOST_AFTER = 1.0
 _STAMP = struct.Struct("<Q")
 
 Send = Callable[[bytes], Awaitable[object] | None]
-Receive = Callable[[bytes], object]
+Receive = Callable[[bytes], Awaitable[object] | None]
+"""What it gives is waited for where there is an event loop."""
 
 
-class Block(r2p.Message):
-    """Bytes of any size."""
-
-    data: Annotated[bytes, r2p.Max(LARGEST)] = b""
+@functools.cache
+def block(largest: int) -> type[r2p.Message]:
+    """The type of bytes of any size up to `largest`."""
+    data = Annotated[bytes, r2p.Max(largest)]
+    return type("Block", (r2p.Message,), {"__annotations__": {"data": data}, "data": b"", "__module__": __name__})
 
 
 class Open(NamedTuple):
@@ -56,16 +59,16 @@ class Way(NamedTuple):
     """A name, and how to open one end: with None it listens, otherwise it connects to that address."""
 
     name: str
-    open: Callable[[int | None], contextlib.AbstractAsyncContextManager[Open]]
+    open: Callable[[int | None, int], contextlib.AbstractAsyncContextManager[Open]]
     loop: str = "uvloop"
 
 
 # r2p
 
 
-def _r2p(kind: str) -> Callable[[int | None], contextlib.AbstractAsyncContextManager[Open]]:
+def _r2p(kind: str) -> Callable[[int | None, int], contextlib.AbstractAsyncContextManager[Open]]:
     @contextlib.asynccontextmanager
-    async def opened(port: int | None) -> AsyncIterator[Open]:
+    async def opened(port: int | None, largest: int) -> AsyncIterator[Open]:
         listening = TcpListenTransport(parse("tcp-listen:127.0.0.1:0"))
         if kind == "tcp":
             via: Any = listening if port is None else f"tcp:127.0.0.1:{port}"
@@ -74,7 +77,11 @@ def _r2p(kind: str) -> Callable[[int | None], contextlib.AbstractAsyncContextMan
         module = r2p.Module("SERVER" if port is None else "CLIENT", via=[via], watchdog=False)
         async with module:
             node = module.start(_hold)
-            yield Open(port_of(module) if port is None else 0, _advertiser(node), _subscriber(node))
+            yield Open(
+                port_of(module) if port is None else 0,
+                _advertiser(node, block(largest)),
+                _subscriber(node, block(largest)),
+            )
 
     return opened
 
@@ -83,22 +90,24 @@ async def _hold(_: r2p.Node) -> None:
     await asyncio.Event().wait()
 
 
-def _advertiser(node: r2p.Node) -> Callable[[str], Coroutine[Any, Any, Send]]:
+def _advertiser(node: r2p.Node, kind: type[Any]) -> Callable[[str], Coroutine[Any, Any, Send]]:
     async def advertise(topic: str) -> Send:
-        publisher = node.advertise(topic, Block)
+        publisher = node.advertise(topic, kind)
         await publisher.wait_subscriber()
-        return lambda data: publisher.publish(Block(data))
+        return lambda data: publisher.publish(kind(data))
 
     return advertise
 
 
-def _subscriber(node: r2p.Node) -> Callable[[str, Receive], Awaitable[object]]:
+def _subscriber(node: r2p.Node, kind: type[Any]) -> Callable[[str, Receive], Awaitable[object]]:
     async def subscribe(topic: str, receive: Receive) -> None:
-        subscriber = node.subscribe(topic, Block, queue=64)
+        subscriber = node.subscribe(topic, kind, queue=64)
 
         async def deliver() -> None:
             async for message in subscriber:
-                receive(message.data)
+                sent = receive(message.data)
+                if sent is not None:
+                    await sent
 
         _keep(asyncio.create_task(deliver()))
 
@@ -117,7 +126,7 @@ def _keep(what: object) -> None:
 
 
 @contextlib.asynccontextmanager
-async def _zenoh(port: int | None) -> AsyncIterator[Open]:
+async def _zenoh(port: int | None, _largest: int) -> AsyncIterator[Open]:
     """zenoh-python with callbacks in its own thread."""
     with contextlib.ExitStack() as stack:
         address = 0
@@ -139,7 +148,7 @@ async def _zenoh(port: int | None) -> AsyncIterator[Open]:
 
 
 @contextlib.asynccontextmanager
-async def _lcm(port: int | None) -> AsyncIterator[Open]:
+async def _lcm(port: int | None, _largest: int) -> AsyncIterator[Open]:
     """LCM over UDP multicast that stays on this computer, and a thread that handles."""
     import lcm
 
@@ -167,7 +176,7 @@ async def _lcm(port: int | None) -> AsyncIterator[Open]:
 
 
 @contextlib.asynccontextmanager
-async def _cyclonedds(port: int | None) -> AsyncIterator[Open]:
+async def _cyclonedds(port: int | None, _largest: int) -> AsyncIterator[Open]:
     """Cyclone DDS: reliable, all kept, on the loopback interface, with a listener."""
     from cyclonedds.core import Listener, Policy, Qos
     from cyclonedds.domain import Domain, DomainParticipant
@@ -218,12 +227,12 @@ def _dds_type() -> Any:
 
 
 @contextlib.asynccontextmanager
-async def _pycyphal2(_: int | None) -> AsyncIterator[Open]:
+async def _pycyphal2(port: int | None, _largest: int) -> AsyncIterator[Open]:
     """pycyphal 2 over UDP multicast on the loopback interface, best effort as it is by default."""
     from pycyphal2 import Instant, Node
     from pycyphal2.udp import UDPTransport
 
-    node = Node.new(UDPTransport.new_loopback(), "server" if _ is None else "client")
+    node = Node.new(UDPTransport.new_loopback(), "server" if port is None else "client")
 
     async def advertise(topic: str) -> Send:
         publisher = node.advertise(topic)
@@ -235,7 +244,9 @@ async def _pycyphal2(_: int | None) -> AsyncIterator[Open]:
 
         async def deliver() -> None:
             async for arrival in subscriber:
-                receive(bytes(arrival.message))
+                sent = receive(bytes(arrival.message))
+                if sent is not None:
+                    await sent
 
         _keep(asyncio.create_task(deliver()))
 
@@ -289,11 +300,11 @@ class _Counter:
         return Count(self._messages, self._last - self._first, tuple(self._latencies))
 
 
-def serve(pipe: Connection, name: str) -> None:
+def serve(pipe: Connection, name: str, largest: int) -> None:
     """The process that counts `counted`, and sends `there` `back`, until the pipe is closed."""
 
     async def main() -> None:
-        async with WAYS[name].open(None) as end:
+        async with WAYS[name].open(None, largest) as end:
             counter = _Counter()
             pipe.send(end.address)
             await end.subscribe("counted", counter.receive)
@@ -311,13 +322,9 @@ def serve(pipe: Connection, name: str) -> None:
 async def _echo(end: Open) -> None:
     """Begin to send back as soon as there is a subscriber: what comes before that is dropped."""
     advertising = asyncio.create_task(end.advertise("back"))
-    sending: set[asyncio.Future[object]] = set()
 
-    def echo(data: bytes) -> None:
-        if advertising.done() and (sent := advertising.result()(data)) is not None:
-            task = asyncio.ensure_future(sent)
-            sending.add(task)
-            task.add_done_callback(sending.discard)
+    def echo(data: bytes) -> Awaitable[object] | None:
+        return advertising.result()(data) if advertising.done() else None
 
     await end.subscribe("there", echo)
 
@@ -403,11 +410,11 @@ class Client:
 T = TypeVar("T")
 
 
-def measure(name: str, use: Callable[[Client], Coroutine[Any, Any, T]]) -> T:
-    """What `use` gives with a client of that way, and a server in a process of its own."""
+def measure(name: str, use: Callable[[Client], Coroutine[Any, Any, T]], largest: int = LARGEST) -> T:
+    """What `use` gives with a client, and a server in a process of its own; `largest`: bytes of a message."""
 
     async def main(port: int, pipe: Connection) -> T:
-        async with WAYS[name].open(port) as end:
+        async with WAYS[name].open(port, largest) as end:
             came: list[Client] = []
             await end.subscribe("back", lambda data: came[0].answered(data) if came else None)
             client = Client(pipe, await end.advertise("counted"), await end.advertise("there"))
@@ -415,7 +422,7 @@ def measure(name: str, use: Callable[[Client], Coroutine[Any, Any, T]]) -> T:
             await _answers(client)
             return await use(client)
 
-    with process(serve, name) as server:
+    with process(serve, name, largest) as server:
         return run_on(WAYS[name].loop, main(server.recv(), server))
 
 

@@ -1,5 +1,6 @@
 """zenoh's own two measurements by size of payload: what goes through, and there and back; r2p beside zenoh-python."""
 
+import functools
 from collections.abc import Iterator
 from statistics import median
 from typing import NamedTuple
@@ -22,19 +23,19 @@ class Point(NamedTuple):
     trip: float
 
 
-async def curve(client: Client) -> list[Point]:
-    """A point for each size."""
-    points = []
-    for size in SIZES:
-        _, count = await client.stream(size, SECONDS)
-        trips = await client.ping(size, ROUNDS if size < SIZES[-1] else ROUNDS // 6)
-        points.append(Point(size, rate_of(count), median(trips) if trips else 0.0))
-    return points
+async def _point(client: Client, size: int) -> Point:
+    _, count = await client.stream(size, SECONDS)
+    trips = await client.ping(size, ROUNDS if size < SIZES[-1] else ROUNDS // 6)
+    return Point(size, rate_of(count), median(trips) if trips else 0.0)
+
+
+def _measure(name: str, size: int) -> Point:
+    return measure(name, functools.partial(_point, size=size), max(size, 64))
 
 
 def rows() -> Iterator[Row]:
-    ours, bare = measure(OURS, curve), measure(BARE, curve)
-    for mine, theirs in zip(ours, bare, strict=True):
+    for size in SIZES:
+        mine, theirs = _measure(OURS, size), _measure(BARE, size)
         yield Row(
             f"zenoh, {mine.size} bytes: stream; there and back, p50",
             f"{rate(mine.rate)}; {mine.trip * 1e6:.0f} us",

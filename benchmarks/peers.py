@@ -33,7 +33,7 @@ def rate_of(count: Count) -> float:
 
 
 def rows() -> Iterator[Row]:
-    turns = [{name: measure(name, both) for name in WAYS} for _ in range(RUNS)]
+    turns = [{name: measure(name, both, SIZE) for name in WAYS} for _ in range(RUNS)]
     ours = _middle([turn["r2p over zenoh"] for turn in turns])
     tcp = _middle([turn["r2p over TCP"] for turn in turns])
     for name in WAYS:

@@ -48,9 +48,11 @@ _RING_UNKNOWN = 512  # ... without a type, when all that is known of the message
 WINDOW = 2048
 """Messages of one publisher on the way to one subscriber's module, at most."""
 
-_WINDOW_MIN = 32  # ... where messages may be long: the publisher limits their bytes
-_WINDOW_BYTES = 192 * 1024  # bytes of those: five topics at full speed fit into zenoh's own queue of 1 MB
+_WINDOW_MIN = 32  # ... where zenoh keeps few packets, as messages may be very long
+_WINDOW_BYTES = 192 * 1024  # bytes of those that count in messages only, as the publisher limits the bytes of longer
+# ones: five topics at full speed fit into zenoh's own queue of 1 MB
 _UNKNOWN_SIZE = 1024  # bytes that the messages of a topic without a type are expected to have, at most
+_LONGEST_IN_WINDOW = _RING_BYTES // 512  # zenoh keeps two windows of short ones, each in a packet of its own
 _OVERHEAD = 32  # bytes of a message besides its payload, in a packet of several: its stamp and its share of the header
 _FINAL_CREDITS_MAX = 256  # sessions that learn that a topic is no longer subscribed to; older ones may be long gone
 _SENDERS_MAX = 4096  # senders whose serials a stream remembers, and topics whose serials outlast an outage
@@ -519,7 +521,9 @@ class ZenohReceiver:
         size = _UNKNOWN_SIZE if topic.layout is None else topic.layout.size
         if topic.accepted:
             size = max(each.size for each in topic.accepted)
-        return min(WINDOW, max(_WINDOW_MIN, _WINDOW_BYTES // (size + _OVERHEAD)))
+        if size > _LONGEST_IN_WINDOW:
+            return _WINDOW_MIN
+        return min(WINDOW, _WINDOW_BYTES // (min(size, UNCOUNTED_BYTES) + _OVERHEAD))
 
     # Publishers
 
