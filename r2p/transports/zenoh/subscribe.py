@@ -49,7 +49,7 @@ WINDOW = 2048
 """Messages of one publisher on the way to one subscriber's module, at most."""
 
 _WINDOW_MIN = 32  # ... where zenoh keeps few packets, as messages may be very long
-_WINDOW_BYTES = 192 * 1024  # bytes of all but long ones, which their publisher limits: five topics fit into zenoh's 1 MB
+_WINDOW_BYTES = 192 * 1024  # bytes of all but long ones, which the publisher limits: five topics fit into 1 MB
 _UNKNOWN_SIZE = 1024  # bytes that the messages of a topic without a type are expected to have, at most
 _LONGEST_IN_WINDOW = _RING_BYTES // 512  # zenoh keeps two windows of short ones, each in a packet of its own
 _OVERHEAD = 32  # bytes of a message besides its payload, in a packet of several: its stamp and its share of the header
