@@ -72,7 +72,7 @@ def _drive_r2p(port: int, pipe: Connection) -> Result:
 @contextmanager
 def bare_listener(*, shm: bool = True) -> Iterator[tuple[zenoh.Session, int]]:
     """A session, and the port where it accepts connections."""
-    with zenoh.open(_config("peer", "listen", 0, shm=shm)) as session:
+    with zenoh.open(bare_config("peer", "listen", 0, shm=shm)) as session:
         yield session, port_of_session(session)
 
 
@@ -85,10 +85,10 @@ def port_of_session(session: zenoh.Session) -> int:
 
 def bare_client(port: int, *, shm: bool = True) -> zenoh.Session:
     """A session that connects to that port."""
-    return zenoh.open(_config("client", "connect", port, shm=shm))
+    return zenoh.open(bare_config("client", "connect", port, shm=shm))
 
 
-def _config(mode: str, way: str, port: int, *, shm: bool) -> zenoh.Config:
+def bare_config(mode: str, way: str, port: int, *, shm: bool) -> zenoh.Config:
     config = zenoh.Config()
     config.insert_json5("transport/shared_memory/enabled", json.dumps(shm))
     config.insert_json5("scouting/multicast/enabled", "false")

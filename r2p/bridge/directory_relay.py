@@ -223,13 +223,18 @@ class DirectoryRelay:
         link = self._link(port)
         if link.asked and now >= link.answered_at + _APART:
             link.asked, link.answering, link.answered_at = False, True, now
-            link.to_repeat = deque(link.announced)
+            self._begin_repetition(link, now)
         if link.repeat_at is None or now >= link.repeat_at:
             if link.repeat_at is not None and link.to_repeat is None:
-                link.to_repeat = deque(link.announced)
+                self._begin_repetition(link, now)
             link.repeat_at = now + period
         if link.to_repeat is not None:
             self._repeat_slice(port, link, link.to_repeat, now)
+
+    def _begin_repetition(self, link: _LinkDirectory, now: int) -> None:
+        link.to_repeat = deque(link.announced)
+        for port in self._ports.values():
+            port.link.discovery.refresh_ages(now)
 
     def _put_off(self, port: BridgePort, now: int) -> None:
         """Look again soon, because that link can't announce now."""

@@ -5,9 +5,12 @@ Each is a key that zenoh keeps while the session that declared it lives.
     1/SESSION/module/NAME/INSTANCE/FLAGS/HOPS
     1/SESSION/pub|sub/TOPIC/INSTANCE/NODE/CLASS/SIZE/FINGERPRINT/WINDOW/HOPS
     2/SESSION/version/INSTANCE/WIRE/RELEASE
+    3/SESSION/tokens/TOKEN;TOKEN;...
 
-The first part is the version; tokens of another version are ignored. The last token was added later: with a 2, modules
-that know the first two only ignore it. `SESSION` is the instance of the r2p module that declares the token, in hex;
+The first part is the version; tokens of another version are ignored. The last two were added later: with a 2 or a 3,
+modules that know the first two only ignore them. The last one is a pack: several other tokens of its session in one
+key, each without the session, and with `,` for its slashes. zenoh's work grows with the number of keys, hardly with
+their length. `SESSION` is the instance of the r2p module that declares the token, in hex;
 `INSTANCE` is that of the module concerned, another one behind gateways (`HOPS` counts them), and `-` for firmware. `-`
 stands also for a node, a fingerprint or a release that is not known; `%` for each slash of a topic or a module. Names
 are whole. `SIZE` is that of a message, up to 64 MiB; `v` and the bound, if the length varies. Modules from before there
@@ -18,7 +21,9 @@ numbers the keys that zenoh passes on to it, up to their first wildcard, and kee
 lives: so a key without a wildcard would stay in the memory of every router, for each module that has ever been there.
 """
 
+import functools
 import re
+from collections.abc import Sequence
 
 import msgspec
 
@@ -31,10 +36,23 @@ from r2p.names import CARRIED_MAX, MODULE_PATH, MODULE_PATH_MAX, NODE, TOPIC
 VERSION = "1"
 _SOFTWARE_VERSION = "2"
 
+_PACK_VERSION = "3"
+
+PACKED = "tokens"
+"""The part of the key that marks a pack."""
+
+PACK_MAX = 64
+"""Tokens in a pack, at most."""
+
+PACK_LENGTH_MAX = 32_768
+"""Characters of a pack, at most: 64 tokens of the longest names. zenoh's messages hold 64 kB without being cut."""
+
 KEY_PREFIX = "live"
 """The part of the key under which tokens are watched."""
 
 _WILD = "*/"
+
+_CACHED = 256  # keys whose tokens are kept: 8 MB of the longest ones
 
 _NONE = "-"
 _HEX32 = r"[0-9a-f]{1,8}"
@@ -46,6 +64,7 @@ _TOPIC = re.compile(
     r"/([0-9]{1,3})/(v?)([0-9]{1,8})/([0-9a-f]{16}|-)/([0-9]{1,6})/([0-9]{1,2})"
 )
 _SOFTWARE = re.compile(rf"({_HEX32})/version/({_HEX32})/([0-9]{{1,3}})/([A-Za-z0-9.+_-]{{1,{RELEASE_MAX}}})")
+_PACK = re.compile(rf"{_PACK_VERSION}/({_HEX32})/{PACKED}/([^/]+)")
 _BYTE_MAX = 0xFF
 _OBSERVER = 0x80
 FLAGS_MASK = 0x7F
@@ -55,7 +74,7 @@ _ROLES = {"pub": ROLE_PUBLISHES, "sub": ROLE_SUBSCRIBES}
 _ROLE_NAMES = {role: name for name, role in _ROLES.items()}
 
 
-class ModuleToken(msgspec.Struct, frozen=True):
+class ModuleToken(msgspec.Struct, frozen=True, gc=False):
     """A running module. `flags` are the FLAG_... bits of ALIVE. Firmware behind a gateway has no `instance`."""
 
     session: int
@@ -66,7 +85,7 @@ class ModuleToken(msgspec.Struct, frozen=True):
     hops: int = 0
 
 
-class TopicToken(msgspec.Struct, frozen=True):
+class TopicToken(msgspec.Struct, frozen=True, gc=False):
     """A publisher or subscriber (`role` is ROLE_...) of a topic.
 
     `publisher_class` is CLASS_..., a sum; `size` in bytes, 0: unknown. A subscriber with a `window` wants its
@@ -86,7 +105,7 @@ class TopicToken(msgspec.Struct, frozen=True):
     varies: bool = False
 
 
-class SoftwareToken(msgspec.Struct, frozen=True):
+class SoftwareToken(msgspec.Struct, frozen=True, gc=False):
     """The versions of the module that runs as `instance`: `wire` and `release` as in its HELLO."""
 
     session: int
@@ -153,6 +172,56 @@ def decode(key: str) -> Token:
     raise DecodeError(f"{key[:80]!r} is not a token")
 
 
+def pack(tokens: Sequence[str]) -> str:
+    """Return the key that stands for several tokens of one session; that of a single one is the token itself."""
+    if len(tokens) == 1:
+        return tokens[0]
+    _, session, _ = tokens[0].split("/", 2)
+    return f"{_PACK_VERSION}/{session}/{PACKED}/" + ";".join(map(_without_session, tokens))
+
+
+def unpack(key: str) -> list[str]:
+    """Return the tokens that a key stands for, to be decoded each: itself, if it is not a pack.
+
+    Raises DecodeError for a pack that is none.
+    """
+    if not key.startswith(f"{_PACK_VERSION}/"):
+        return [key]
+    found = _PACK.fullmatch(key) if len(key) <= PACK_LENGTH_MAX else None
+    if found is None or found[2].count(";") >= PACK_MAX:
+        raise DecodeError(f"{key[:80]!r} is not a pack of tokens")
+    tokens = []
+    for packed in found[2].split(";"):
+        version, _, rest = packed.partition(",")
+        tokens.append(f"{version}/{found[1]}/{rest.replace(',', '/')}")
+    return tokens
+
+
+@functools.lru_cache(_CACHED)
+def tokens_of(key: str) -> tuple[dict[str, Token], list[DecodeError]]:
+    """Return the tokens that a key stands for, by their own keys, and an error for each part that is none.
+
+    Of the last ones the results are kept, not to be changed: all modules of a program get the same keys.
+    """
+    tokens: dict[str, Token] = {}
+    errors: list[DecodeError] = []
+    try:
+        parts = unpack(key)
+    except DecodeError as error:
+        return tokens, [error]
+    for part in parts:
+        try:
+            tokens[part] = decode(part)
+        except DecodeError as error:
+            errors.append(error)
+    return tokens, errors
+
+
+def _without_session(token: str) -> str:
+    version, _, rest = token.split("/", 2)
+    return f"{version},{rest.replace('/', ',')}"
+
+
 def is_representable(token: Token) -> bool:
     """Return whether the token survives encoding and decoding. Names from another link may contain characters with a
     meaning in keys or key expressions of zenoh, such as `/` and `*`.
@@ -173,13 +242,14 @@ def token_of(suffix: str) -> str:
     return suffix.removeprefix(_WILD)
 
 
-def is_module(key: str) -> bool:
-    """Return whether a key is the token of a module, not of a tool."""
-    try:
-        token = decode(key)
-    except DecodeError:
-        return False
-    return isinstance(token, ModuleToken) and not token.observer
+def is_module(key: str, *, tools: bool = False) -> bool:
+    """Return whether a key has the token of a module, or with `tools`, of a tool."""
+    return any(isinstance(each, ModuleToken) and (tools or not each.observer) for each in tokens_of(key)[0].values())
+
+
+def has_publisher(key: str) -> bool:
+    """Return whether a key has the token of a publisher."""
+    return any(isinstance(each, TopicToken) and each.role == ROLE_PUBLISHES for each in tokens_of(key)[0].values())
 
 
 def _text(text: str) -> str:

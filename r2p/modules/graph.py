@@ -101,6 +101,8 @@ class NetworkView:
         module = self._opened()
         now = module.space.clock.monotonic()
         own = self._own_view(module)
+        for link in module.links:
+            link.discovery.refresh_ages(now)
         others = [_module_view(link, info, now) for link in module.links for info in link.discovery.modules.values()]
         return [own, *sorted(others, key=lambda view: (view.name, view.link))]
 
@@ -278,6 +280,8 @@ class NetworkView:
         if name == module.space.module:
             return self._own_view(module)
         now = module.space.clock.monotonic()
+        for link in module.links:
+            link.discovery.refresh_ages(now)
         infos = ((link, link.discovery.modules.get(name)) for link in module.links)
         found = [_module_view(link, info, now) for link, info in infos if info is not None]
         return min(found, key=lambda each: (each.kind == "ROS", each.age), default=None)  # it may be seen as both
@@ -365,6 +369,7 @@ def _set_ages(views: dict[str, TopicView], space: TopicSpace) -> None:
         if not topic.unused:
             announced[topic.name] = now
     for link in space.links:
+        link.discovery.refresh_ages(now)
         for info in link.discovery.topics.values():
             at = max(info.advertised_at or 0, info.requested_at or 0)
             announced[info.name] = max(at, announced.get(info.name, 0))

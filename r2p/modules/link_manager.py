@@ -477,6 +477,9 @@ class LinkManager:
     def _confirm_conflict(self, link: Link, name: str, suspected: int) -> None:
         """Report the conflict if both modules were heard since it was suspected (monotonic ns)."""
         self._suspected.discard(name)
+        now = self.space.clock.monotonic()
+        for each in self.links:
+            each.discovery.refresh_ages(now)
         links = {
             info.instance: link
             for link, info in self._same_name(link, name)

@@ -1,5 +1,6 @@
 """Liveliness tokens as keys."""
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -130,3 +131,62 @@ def test_keys_have_a_wildcard_so_that_zenoh_forgets_them_and_may_lack_it() -> No
     assert liveliness.token_key(token) == f"live/*/{token}"
     assert liveliness.token_of(liveliness.token_key(token).removeprefix("live/")) == token
     assert liveliness.token_of(token) == token
+
+
+@given(st.lists(TOKENS, min_size=1, max_size=liveliness.PACK_MAX))
+def test_what_is_packed_is_unpacked(tokens: list[liveliness.Token]) -> None:
+    keys = list(dict.fromkeys(liveliness.encode(msgspec.structs.replace(token, session=0xAB)) for token in tokens))
+    packed = liveliness.pack(keys)
+    assert liveliness.unpack(packed) == keys
+    assert len(packed) <= liveliness.PACK_LENGTH_MAX
+    assert not set(packed) & set("*$#?")
+    found, errors = liveliness.tokens_of(packed)
+    assert (list(found), errors) == (keys, [])
+    assert [liveliness.encode(each) for each in found.values()] == keys
+
+
+def test_a_pack_as_people_see_it() -> None:
+    tokens: list[liveliness.Token] = [ModuleToken(0xAB, "PC1", 0xAB), TopicToken(0xAB, ROLE_PUBLISHES, "a/leds", 0xAB)]
+    assert (
+        liveliness.pack([liveliness.encode(each) for each in tokens])
+        == "3/ab/tokens/1,module,PC1,ab,0,0;1,pub,a%leds,ab,-,0,0,-,0,0"
+    )
+    assert liveliness.pack(["1/ab/module/PC1/ab/0/0"]) == "1/ab/module/PC1/ab/0/0"
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "3/ab",
+        "3/ab/tokens",
+        "3/ab/tokens/",
+        "3/AB/tokens/1,module,PC1,ab,0,0",
+        "3/ab/others/1,module,PC1,ab,0,0",
+        "3/ab/tokens/1,module,PC1,ab,0,0/more",
+        "3/ab/tokens/" + ";" * liveliness.PACK_MAX,
+        "3/ab/tokens/" + "a" * liveliness.PACK_LENGTH_MAX,
+    ],
+)
+def test_packs_that_are_none(key: str) -> None:
+    with pytest.raises(DecodeError):
+        liveliness.unpack(key)
+    found, (error,) = liveliness.tokens_of(key)
+    assert not found
+    assert not isinstance(error, UnknownType)
+
+
+def test_a_part_that_is_no_token_leaves_the_others() -> None:
+    found, errors = liveliness.tokens_of("3/ab/tokens/1,module,PC1,ab,0,0;;7,more;1,pub,x;3,ab,tokens,1")
+    assert list(found.values()) == [ModuleToken(0xAB, "PC1", 0xAB)]
+    assert [isinstance(error, UnknownType) for error in errors] == [True, True, False, True]
+
+
+def test_what_a_key_says_about_its_network() -> None:
+    module, tool = (liveliness.encode(ModuleToken(1, "PC1", 1, observer=each)) for each in (False, True))
+    publisher = liveliness.encode(TopicToken(1, ROLE_PUBLISHES, "leds", 1))
+    subscriber = liveliness.encode(TopicToken(1, ROLE_SUBSCRIBES, "leds", 1))
+    packed = liveliness.pack([tool, subscriber])
+    assert [liveliness.is_module(key) for key in (module, tool, packed, publisher, "")] == [True, *[False] * 4]
+    assert liveliness.is_module(packed, tools=True)
+    assert not liveliness.has_publisher(packed)
+    assert liveliness.has_publisher(liveliness.pack([subscriber, publisher]))

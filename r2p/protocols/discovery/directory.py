@@ -71,7 +71,7 @@ class TopicInfo(msgspec.Struct):
         self.fingerprint = None if best.fingerprint == management.ANY_TYPE else best.fingerprint
 
 
-class EndpointInfo(msgspec.Struct, frozen=True):
+class EndpointInfo(msgspec.Struct, frozen=True, gc=False):
     """A publisher or subscriber of a node, as announced by its r2p module.
 
     `module` is empty until the HELLO of this `instance` was received.

@@ -108,6 +108,12 @@ class DiscoveryProtocol(ABC):
         """Return the address of an r2p module on the link itself; None if it is not known, or behind a gateway."""
         return None
 
+    def refresh_ages(self, now: int) -> None:
+        """Bring the times at which things were heard up to date, before they are read.
+
+        Nothing is to be done where they are noted as messages come.
+        """
+
     @property
     @abstractmethod
     def generation(self) -> int:
@@ -273,11 +279,12 @@ class DiscoveryProtocol(ABC):
         """Decode a message or a token; None for one that is counted."""
         try:
             return decode(data)
-        except UnknownType:
-            self.counts["unknown type"] += 1
-        except DecodeError:
-            self.counts["undecodable"] += 1
+        except DecodeError as error:
+            self._count_undecodable(error)
         return None
+
+    def _count_undecodable(self, error: DecodeError) -> None:
+        self.counts["unknown type" if isinstance(error, UnknownType) else "undecodable"] += 1
 
     def _commanded(self, now: int, message: management.Order, source: PeerAddress) -> None:
         if message.module == module_alias(self._module):

@@ -7,6 +7,7 @@ gateways' messages about firmware.
 """
 
 from collections import Counter
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -15,7 +16,7 @@ from r2p.codecs.liveliness import ModuleToken, SoftwareToken, TopicToken
 from r2p.names import module_alias
 from r2p.protocols.discovery.aliases import LinkNames, ModuleAliases
 from r2p.protocols.discovery.announcer import LocalTopic, Relayed
-from r2p.protocols.discovery.directory import TABLE_MAX, Demand
+from r2p.protocols.discovery.directory import Demand, decrement
 from r2p.protocols.discovery.events import (
     Event,
     ModuleInfo,
@@ -29,11 +30,17 @@ from r2p.protocols.liveliness.modules import ModuleRegistry
 from r2p.protocols.liveliness.tokens import Matching, TokenSet
 from r2p.units import SECOND
 
-TOKENS_MAX = 4 * TABLE_MAX
-"""Tokens of other modules, at most."""
+if TYPE_CHECKING:
+    from collections.abc import Collection
 
-_MARK_EVERY = SECOND // 2
-"""Ns after which everything with a token is marked as heard once more."""
+TOKENS_MAX = 65_536
+"""Tokens of other modules that are kept, unless the link's URL says otherwise."""
+
+TOO_MANY = "too many tokens"
+"""The reason under which tokens without room are counted."""
+
+_MARK_EVERY = SECOND // 4
+"""Ns after which everything with a token is marked as heard once more, if anybody wants to know."""
 
 _PAUSE_MIN = 5 * SECOND
 """Ns from when there is room for refused tokens until they are queried; twice as long each time."""
@@ -46,8 +53,15 @@ class LivelinessDiscovery(DiscoveryProtocol):
     """The discovery of one module on a network with liveliness tokens."""
 
     def __init__(
-        self, module: str, instance: int, *, observer: bool = False, counts: Counter[str] | None = None
+        self,
+        module: str,
+        instance: int,
+        *,
+        observer: bool = False,
+        counts: Counter[str] | None = None,
+        tokens_max: int | None = None,
     ) -> None:
+        """`tokens_max`: tokens of other modules that are kept."""
         super().__init__(module, instance, counts, LinkNames())
         self._own = TokenSet(module, instance, observer=observer)
         self._matching = Matching(self._own, self._outbox)
@@ -56,9 +70,14 @@ class LivelinessDiscovery(DiscoveryProtocol):
         self.topics = self._matching.topics
         self.endpoints = self._modules.endpoints
         self._tokens: dict[str, liveliness.Token] = {}
-        self._refused = RefusedTokens(TOKENS_MAX, instance)
+        self._carried: dict[str, Collection[str]] = {}
+        """The tokens that each key of other sessions stands for."""
+        self._carriers: Counter[str] = Counter()
+        """How many more keys have a token, of those that several have."""
+        self.tokens_max = TOKENS_MAX if tokens_max is None else tokens_max
+        self._refused = RefusedTokens(self.tokens_max, instance)
         self._aliases = ModuleAliases(module)
-        self._mark_at: int | None = None
+        self._marked_at = 0
 
     @property
     def generation(self) -> int:
@@ -82,6 +101,14 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
     def module_behind(self, alias: str) -> str:
         return next((name for name in self.modules if module_alias(name) == alias), self._aliases.name_of(alias))
+
+    def refresh_ages(self, now: int) -> None:
+        """Mark everything with a token as heard: it is there, though nothing is repeated."""
+        if now < self._marked_at + _MARK_EVERY:
+            return
+        self._marked_at = now
+        self._matching.mark_heard(now)
+        self._modules.mark_heard(now)
 
     # For gateways
 
@@ -149,6 +176,8 @@ class LivelinessDiscovery(DiscoveryProtocol):
         self._outbox.emit(*self._own.withdraw_all())
         for key in list(self._tokens):
             self._remove_token(now, key)
+        self._carried.clear()
+        self._carriers.clear()
         self._refused.clear()
         self._modules.clear()  # only firmware is left, which gateways announce by messages
         return self._outbox.drain()
@@ -162,15 +191,13 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def next_deadline(self) -> int | None:
         if self._outbox.up and self._own.has_changes:
             return 0
-        due = (self._modules.next_deadline(), self._refused.next_deadline(), self._mark_at)
+        due = (self._modules.next_deadline(), self._refused.next_deadline())
         return min((each for each in due if each is not None), default=None)
 
     def poll(self, now: int) -> list[Event]:
-        """Declare changes of this module; mark everything with a token as heard; query refused tokens."""
+        """Declare changes of this module; query refused tokens."""
         if self._outbox.up:
             self._outbox.emit(*self._own.pop_changes())
-        if self._mark_at is not None and self._mark_at <= now:
-            self._mark_heard(now)
         if self._refused.begin_query(now, self._free):
             self._outbox.emit(QueryTokens())
         self._modules.poll(now)
@@ -189,15 +216,47 @@ class LivelinessDiscovery(DiscoveryProtocol):
     # Tokens of other modules
 
     def appeared(self, now: int, key: str) -> list[Event]:
-        """Handle a token that exists; ignore a known one."""
-        token = None if key in self._tokens else self._decode(liveliness.decode, key)
-        if token is None or token.session == self._instance:
+        """Handle a key that exists, with its tokens; ignore a known one."""
+        if key in self._carried:
             return self._outbox.drain()
-        if len(self._tokens) >= TOKENS_MAX:
-            return self.refused(now)
+        tokens = self._tokens_of(key)
+        known = [each for each in tokens if each in self._tokens]
+        new = len(tokens) - len(known)
+        if new > self._free:
+            return self.refused(now, new)
+        if tokens:
+            self._carried[key] = tokens.keys()
+        for carried, token in tokens.items():
+            if known and carried in self._tokens:
+                self._carriers[carried] += 1  # another key has it, too
+            else:
+                self._add_token(now, carried, token)
+        return self._outbox.drain()
+
+    def disappeared(self, now: int, key: str) -> list[Event]:
+        """Handle the end of a key, and of those of its tokens that no other key has."""
+        carried = self._carried.pop(key, None)
+        if carried is None:
+            self._refused.remove_one()
+        for each in carried or ():
+            if each in self._carriers:
+                decrement(self._carriers, each)
+            else:
+                self._remove_token(now, each)
+        self._review_refused(now)
+        return self._outbox.drain()
+
+    def _tokens_of(self, key: str) -> dict[str, liveliness.Token]:
+        """Return the tokens of another session that a key stands for; count what is none."""
+        tokens, errors = liveliness.tokens_of(key)
+        for error in errors:
+            self._count_undecodable(error)
+        if any(token.session == self._instance for token in tokens.values()):  # of one, as a key has one session
+            return {}
+        return tokens
+
+    def _add_token(self, now: int, key: str, token: liveliness.Token) -> None:
         self._tokens[key] = token
-        if self._mark_at is None:
-            self._mark_at = now + _MARK_EVERY
         if isinstance(token, ModuleToken):
             self._modules.module_appeared(now, key, token)
         elif isinstance(token, SoftwareToken):
@@ -206,21 +265,11 @@ class LivelinessDiscovery(DiscoveryProtocol):
             self._modules.endpoint_appeared(token)
             if not token.hops:  # behind a gateway: its own tokens say what it passes on
                 self._matching.appeared(now, key, token)
-        return self._outbox.drain()
 
-    def disappeared(self, now: int, key: str) -> list[Event]:
-        """Handle the end of a token."""
-        if key in self._tokens:
-            self._remove_token(now, key)
-        else:
-            self._refused.remove_one()
-        self._review_refused(now)
-        return self._outbox.drain()
-
-    def refused(self, now: int) -> list[Event]:
-        """Count a token for which there was no room."""
-        self.counts["too many tokens"] += 1
-        return self.missed(now, 1)
+    def refused(self, now: int, count: int = 1) -> list[Event]:
+        """Count tokens for which there was no room."""
+        self.counts[TOO_MANY] += count
+        return self.missed(now, count)
 
     def missed(self, now: int, count: int) -> list[Event]:
         """Note that so many tokens may be unreported, which are queried when there is room."""
@@ -249,7 +298,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
     @property
     def _free(self) -> int:
-        return TOKENS_MAX - len(self._tokens)
+        return self.tokens_max - len(self._tokens)
 
     def _review_refused(self, now: int) -> None:
         if self._outbox.up:
@@ -265,13 +314,6 @@ class LivelinessDiscovery(DiscoveryProtocol):
             self._modules.endpoint_disappeared(token)
             if not token.hops:
                 self._matching.disappeared(key, token)
-        if not self._tokens:
-            self._mark_at = None
-
-    def _mark_heard(self, now: int) -> None:
-        self._mark_at = now + _MARK_EVERY
-        self._matching.mark_heard(now)
-        self._modules.mark_heard(now)
 
     # Messages
 
@@ -306,6 +348,8 @@ class RefusedTokens:
         self._any = False
         self._count = 0
         """An estimate: a token that ended may have been a refused one."""
+        self._largest = 0
+        """Tokens of the largest refused pack: with less room, it would be refused again."""
         self._query_at: int | None = None
         self._querying = False
         self._pause = _PAUSE_MIN
@@ -315,6 +359,7 @@ class RefusedTokens:
         """Count refused tokens."""
         self._any = True
         self._count += count
+        self._largest = max(self._largest, count)
 
     def remove_one(self) -> None:
         """Note the end of a token that was not kept."""
@@ -323,7 +368,7 @@ class RefusedTokens:
     def clear(self) -> None:
         """Start over: all tokens are gone, and will be reported again."""
         self._any = False
-        self._count = 0
+        self._count = self._largest = 0
         self._query_at = None
 
     def next_deadline(self) -> int | None:
@@ -345,7 +390,7 @@ class RefusedTokens:
         self._query_at = None
         if not self._fit(free):
             return False
-        self._any, self._count, self._querying = False, 0, True
+        self._any, self._count, self._largest, self._querying = False, 0, 0, True
         self._last_query, self._pause = now, min(2 * self._pause, _PAUSE_MAX)
         return True
 
@@ -357,4 +402,4 @@ class RefusedTokens:
 
     def _fit(self, free: int) -> bool:
         # As the count is an estimate, a quarter of the table is enough in any case.
-        return self._any and free >= min(max(self._count, 1), self._enough)
+        return self._any and free >= min(max(self._count, self._largest, 1), self._enough)

@@ -1,8 +1,8 @@
 """Liveliness tokens of this module, and which topics flow between it and each other session because of them.
 
-`TokenSet` decides which tokens to declare and undeclare. Changes are collected, and become events all at once:
-so a publisher that is announced first and gets the name of its node a moment later is one token, and a change declares
-the new token before it undeclares the old one.
+`TokenSet` decides which tokens to declare and undeclare, several in a key. Changes are collected, and become events all
+at once: so a publisher that is announced first and gets the name of its node a moment later is one token, and a change
+declares the new token before it undeclares the old one.
 
 `Matching` compares these tokens with those of others. Both sides see each other's, so both know when two types don't
 fit, and report it to their own user.
@@ -10,6 +10,7 @@ fit, and report it to their own user.
 
 from collections import Counter
 from collections.abc import Iterator
+from typing import cast
 
 import msgspec
 
@@ -30,13 +31,17 @@ from r2p.protocols.discovery.events import (
     TopicType,
     Undeclare,
 )
+from r2p.protocols.liveliness.packing import TokenPacker
 from r2p.version import __version__
 
 TopicRole = tuple[str, int]
 """A topic, and ROLE_PUBLISHES or ROLE_SUBSCRIBES."""
 
-_MODULE: TopicRole = ("", 0)  # stands for the token of the module itself, where topics and roles are keys
-_RELAYED: TopicRole = ("", -1)  # ... and for all that is relayed
+_Subject = tuple[str | int, ...]
+"""What tokens are about: a TopicRole, the module itself, or the key of something relayed, behind `_RELAYED`."""
+
+_MODULE: _Subject = ("module",)
+_RELAYED = "relayed"
 
 
 class TokenSet:
@@ -49,93 +54,107 @@ class TokenSet:
         self._observer = observer
         self._topics: dict[TopicRole, LocalTopic] = {}
         self._nodes: dict[TopicRole, dict[str, int]] = {}
-        self._relayed: dict[tuple[str | int, ...], liveliness.Token] = {}
-        self._declared: dict[TopicRole, set[str]] = {}
-        self._dirty: set[TopicRole] = {_MODULE}
-        """Topics that may need other tokens than are declared."""
+        self._relayed: dict[_Subject, liveliness.Token] = {}
+        self._present: dict[_Subject, set[str]] = {}
+        """The tokens that are declared, or about to be."""
+        self._module_key = ""
+        """The declared key of the module itself, and its version: it has no topics, and so hardly ever changes."""
+        self._packer = TokenPacker()
+        self._dirty: dict[_Subject, None] = {_MODULE: None}
+        """Subjects that may need other tokens than are declared, in the order of their change."""
 
     @property
     def has_changes(self) -> bool:
         """Return whether something has changed since `pop_changes` was called."""
-        return bool(self._dirty)
+        return bool(self._dirty) or self._packer.has_changes
 
     def get(self, topic: str, role: int) -> LocalTopic | None:
         return self._topics.get((topic, role))
 
     def set_flags(self, flags: int) -> None:
         self._flags = flags
-        self._dirty.add(_MODULE)
+        self._dirty[_MODULE] = None
 
     def set_topic(self, topic: str, role: int, own: LocalTopic) -> None:
         """Declare that the module publishes or subscribes to a topic."""
         self._topics[topic, role] = own
-        self._dirty.add((topic, role))
+        self._dirty[topic, role] = None
 
     def remove_topic(self, topic: str, role: int) -> None:
         """Undeclare the topic in this role."""
         self._topics.pop((topic, role), None)
-        self._dirty.add((topic, role))
+        self._dirty[topic, role] = None
 
     def add_node(self, topic: str, role: int, node: str, publisher_class: int) -> None:
         """Add a node that publishes or subscribes to the topic; each has a token of its own."""
         self._nodes.setdefault((topic, role), {})[node] = publisher_class
-        self._dirty.add((topic, role))
+        self._dirty[topic, role] = None
 
     def remove_node(self, topic: str, role: int, node: str) -> None:
         nodes = self._nodes.get((topic, role), {})
         nodes.pop(node, None)
         if not nodes:
             self._nodes.pop((topic, role), None)
-        self._dirty.add((topic, role))
+        self._dirty[topic, role] = None
 
-    def set_relayed(self, key: tuple[str | int, ...], token: liveliness.Token | None) -> None:
+    def set_relayed(self, key: _Subject, token: liveliness.Token | None) -> None:
         """Declare a token of a module behind this gateway; None undeclares it."""
         if token is None:
             self._relayed.pop(key, None)
         else:
             self._relayed[key] = token
-        self._dirty.add(_RELAYED)
+        self._dirty[(_RELAYED, *key)] = None
 
-    def relayed(self, key: tuple[str | int, ...]) -> liveliness.Token | None:
+    def relayed(self, key: _Subject) -> liveliness.Token | None:
         return self._relayed.get(key)
 
     def pop_changes(self) -> list[Declare | Undeclare]:
         """Return the declarations and their ends since the last call."""
-        events: list[Declare | Undeclare] = []
-        dirty, self._dirty = self._dirty, set()
-        for key in dirty:
-            declared, wanted = self._declared.get(key, set()), self._wanted(key)
-            events += [Declare(token) for token in sorted(wanted - declared)]
-            events += [Undeclare(token) for token in sorted(declared - wanted)]
+        dirty, self._dirty = self._dirty, {}
+        events = self._module_changes() if dirty.pop(_MODULE, "") is None else []
+        for subject in dirty:
+            present, wanted = self._present.get(subject, set()), self._wanted(subject)
+            for token in sorted(wanted - present):
+                self._packer.add(token)
+            for token in present - wanted:
+                self._packer.remove(token)
             if wanted:
-                self._declared[key] = wanted
+                self._present[subject] = wanted
             else:
-                self._declared.pop(key, None)
-        return events
+                self._present.pop(subject, None)
+        return events + self._packer.pop_changes()
 
     def withdraw_all(self) -> list[Declare | Undeclare]:
         """Undeclare everything, as the network is away; it is declared anew by the next `pop_changes`."""
-        events: list[Declare | Undeclare] = [Undeclare(key) for keys in self._declared.values() for key in keys]
-        self._dirty |= self._declared.keys()
-        self._declared.clear()
+        events = self._packer.withdraw_all()
+        if self._module_key:
+            events.append(Undeclare(self._module_key))
+            self._module_key = ""
+            self._dirty[_MODULE] = None
         return events
 
-    def _wanted(self, key: TopicRole) -> set[str]:
-        if key == _MODULE:
-            return {liveliness.encode(token) for token in self._module_tokens()}
-        if key == _RELAYED:
-            return {liveliness.encode(token) for token in self._relayed.values()}
+    def _module_changes(self) -> list[Declare | Undeclare]:
+        before, self._module_key = self._module_key, liveliness.pack([*self._module_tokens()])
+        if self._module_key == before:
+            return []
+        return [Declare(self._module_key), *([Undeclare(before)] if before else [])]
+
+    def _module_tokens(self) -> Iterator[str]:
+        yield liveliness.encode(ModuleToken(self._instance, self._module, self._instance, self._flags, self._observer))
+        if not self._observer:  # a tool is gone before its version matters
+            release = __version__[: management.RELEASE_MAX]
+            yield liveliness.encode(SoftwareToken(self._instance, self._instance, management.WIRE_VERSION, release))
+
+    def _wanted(self, subject: _Subject) -> set[str]:
+        if subject[0] == _RELAYED:
+            relayed = self._relayed.get(subject[1:])
+            return set() if relayed is None else {liveliness.encode(relayed)}
+        key = cast("TopicRole", subject)
         own = self._topics.get(key)
         if own is None:
             return set()
         nodes = self._nodes.get(key) or {"": 0}
         return {self._token(key, own, node, publisher_class) for node, publisher_class in nodes.items()}
-
-    def _module_tokens(self) -> Iterator[liveliness.Token]:
-        yield ModuleToken(self._instance, self._module, self._instance, self._flags, self._observer)
-        if not self._observer:  # a tool is gone before its version matters
-            release = __version__[: management.RELEASE_MAX]
-            yield SoftwareToken(self._instance, self._instance, management.WIRE_VERSION, release)
 
     def _token(self, key: TopicRole, own: LocalTopic, node: str, publisher_class: int) -> str:
         topic, role = key
@@ -180,15 +199,44 @@ class Matching:
 
     def appeared(self, now: int, key: str, token: TopicToken) -> None:
         """Enter a token of a publisher or subscriber."""
-        session = self._sessions.setdefault(token.session, _PeerSession())
-        topic_role = token.topic, token.role
-        session.tokens.setdefault(topic_role, {})[key] = token
-        self._sessions_of.setdefault(topic_role, {})[token.session] = session
-        self.demand.add(*topic_role, token.session)
-        info = self.topics.setdefault(token.topic, TopicInfo(token.topic))
+        number, topic_role = token.session, (token.topic, token.role)
+        session = self._sessions.get(number)  # `setdefault` would make a new one in vain, for each of many tokens
+        if session is None:
+            session = self._sessions[number] = _PeerSession()
+        tokens = session.tokens.get(topic_role)
+        if tokens is None:
+            session.tokens[topic_role] = {key: token}
+            self._enter(number, session, topic_role)
+        else:
+            tokens[key] = token
+        info = self.topics.get(token.topic)
+        if info is None:
+            info = self.topics[token.topic] = TopicInfo(token.topic)
         info.set_heard(token.role, now)
-        self._update_type(info, token.role)
-        self._match(token.session, session, topic_role)
+        known = info.types.get(token.role)
+        if known is None:  # nobody has declared a type before
+            own = _type_of({key: token})
+            if own != TopicType():
+                info.set_type(token.role, own)
+        elif not (known.size or known.varies) or known.fingerprint == ANY_TYPE:
+            self._update_type(info, token.role)
+        if self._concerns(session, topic_role):
+            self._match(number, session, topic_role)
+
+    def _enter(self, number: int, session: _PeerSession, topic_role: TopicRole) -> None:
+        """Enter a session as one that has the topic in this role."""
+        sessions = self._sessions_of.get(topic_role)
+        if sessions is None:
+            self._sessions_of[topic_role] = {number: session}
+        else:
+            sessions[number] = session
+        self.demand.add(*topic_role, number)
+
+    def _concerns(self, session: _PeerSession, key: TopicRole) -> bool:
+        """Return whether this module has the other role of the topic, or has had it."""
+        topic, role = key
+        has_role = self._own.get(topic, counterpart(role)) is not None
+        return has_role or key in session.matched or key in session.mismatched
 
     def disappeared(self, key: str, token: TopicToken) -> None:
         """Forget a token that is gone."""

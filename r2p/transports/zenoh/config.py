@@ -23,6 +23,8 @@ if TYPE_CHECKING:  # imported when it is used: a URL can be checked without zeno
 
 MODES = ("peer", "client", "router")
 
+_TOKENS_MAX = 131_072  # so many answers of a query always fit into its channel
+
 _NAMED_MAX = 8  # networks that one text names
 
 _NETWORK = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -48,6 +50,8 @@ class ZenohOptions(msgspec.Struct, frozen=True):
     shm: bool | None = None
     """Whether messages may go through shared memory."""
     config: Path | None = None
+    tokens: int | None = None
+    """Tokens of other modules that are kept."""
     key: SharedKey | None = None
 
     def error(self, text: str) -> TransportError:
@@ -78,6 +82,7 @@ def parse_options(url: Url) -> ZenohOptions:
         batching=given.get("batching") != "off",
         shm=None if "shm" not in given else given["shm"] == "on",
         config=None if config is None else Path(config),
+        tokens=given.get("tokens"),
         key=given.get("key"),
     )
 
@@ -131,6 +136,12 @@ def _file_name(text: str) -> str:
     return text
 
 
+def _token_count(text: str) -> int:
+    if not text.isdecimal() or not 0 < int(text) <= _TOKENS_MAX:
+        raise ValueError(f"give the number of tokens that are kept, 1 to {_TOKENS_MAX}")
+    return int(text)
+
+
 def endpoint_text(text: str) -> str:
     """Return a valid endpoint of zenoh, `tcp/router:7447`. Raises ValueError."""
     protocol, _, address = text.partition("/")
@@ -155,6 +166,7 @@ _PARSERS: dict[str, Callable[[str], Any]] = {
     "batching": one_of("on", "off"),
     "shm": one_of("on", "off"),
     "config": _file_name,
+    "tokens": _token_count,
     "key": key_file,
 }
 

@@ -12,6 +12,7 @@ Keys, all under `r2p/NETWORK/`:
 
 import asyncio
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Callable, Hashable
 from typing import Any, ClassVar, cast
@@ -29,11 +30,11 @@ from r2p.protocols.discovery.events import (
     TopicType,
     Undeclare,
 )
-from r2p.protocols.liveliness.session import TOKENS_MAX, LivelinessDiscovery
+from r2p.protocols.liveliness.session import TOKENS_MAX, TOO_MANY, LivelinessDiscovery
 from r2p.runtime.sample import PublisherClass, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.announcement import NOTHING, Announcement
-from r2p.transports.link import Hub, Link, unique_name
+from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link, unique_name
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh.large import LARGE
 from r2p.transports.zenoh.sender import ZenohSender
@@ -70,25 +71,30 @@ class ZenohLink(Link):
     passes_probes: ClassVar[bool] = False
     lossless = True
 
-    def __init__(self, name: str, hub: Hub, *, connects: bool, batching: bool) -> None:
+    def __init__(self, name: str, hub: Hub, *, connects: bool, batching: bool, tokens_max: int | None = None) -> None:
         """`connects`: up while it is connected; otherwise it accepts connections, and is up even alone.
 
-        `batching`: several messages may share a payload.
+        `batching`: several messages may share a payload. `tokens_max`: tokens of other modules that are kept, if
+        not TOKENS_MAX.
         """
         self._connects = connects
         self.instance = hub.instance
         name = unique_name(name, hub)
         counts = LoggedCounter(name, hub.space.clock)
-        self._liveliness = LivelinessDiscovery(hub.space.module, hub.instance, observer=hub.observer, counts=counts)
+        self._liveliness = LivelinessDiscovery(
+            hub.space.module, hub.instance, observer=hub.observer, counts=counts, tokens_max=tokens_max
+        )
         super().__init__(name, hub, discovery=self._liveliness)
         self._session: ZenohSession | None = None
         self._prefix = ""
         self._queues: list[LoopQueue] = []
         self._transports: dict[str, bool] = {}  # the zenoh sessions that it is connected to, by id: by shared memory?
-        self._tokens = TokenDebouncer(hub.space.loop, self._on_token_settled, self._on_token_refused)
-        self._token_changes = self._queue(self._on_token)
-        self._token_answers = self._queue(self._on_token_answer, most=_ANSWERS_MAX)
+        most = self._liveliness.tokens_max
+        self._tokens = TokenDebouncer(hub.space.loop, self._on_token_settled, self._on_token_refused, most)
+        self._token_changes = self._queue(self._on_token, per_turn=KEYS_PER_TURN)
+        self._token_answers = self._queue(self._on_token_answer, most=_ANSWERS_MAX, per_turn=KEYS_PER_TURN)
         self._overflowed = 0
+        self._said_full = False
         self.sender = ZenohSender(self, hub, self._subscribers, batching=batching)
         self.receiver = ZenohReceiver(self, hub)
 
@@ -112,9 +118,11 @@ class ZenohLink(Link):
         queue = functools.partial(self._queue, most=_TYPE_QUERIES_MAX)
         session.answer_queries(f"{prefix}/schema/{self.instance:x}/*", self._schema, queue)
 
-    def _queue(self, handle: Callable[[Any], None], most: int = _EVENTS_MAX) -> LoopQueue:
+    def _queue(
+        self, handle: Callable[[Any], None], most: int = _EVENTS_MAX, per_turn: int = MESSAGES_PER_TURN
+    ) -> LoopQueue:
         """Make a queue from zenoh's threads into the loop."""
-        queue = LoopQueue(self._space.loop, handle, self.stats.lost, most=most)
+        queue = LoopQueue(self._space.loop, handle, self.stats.lost, most=most, per_turn=per_turn)
         self._queues.append(queue)
         return queue
 
@@ -291,6 +299,11 @@ class ZenohLink(Link):
             self.stats.lost.internal_error(error)
         else:
             self._apply(events)
+            if not self._said_full and TOO_MANY in self._liveliness.counts:
+                self._said_full, most = True, self._liveliness.tokens_max
+                text = f"there are more modules and topics on the network than fit into {most} tokens, and "
+                text += f"some stay unknown here: tokens={2 * most} in the URL makes room for more"
+                self._hub.link_notice(self, TOO_MANY, text, trouble=True)
 
     def _on_control(self, message: tuple[bytes, bytes]) -> None:
         self._pass_on(message, self.manage)
@@ -314,6 +327,9 @@ class ZenohLink(Link):
 
 # Tokens of other modules
 
+KEYS_PER_TURN = 16
+"""Keys that are handled before the event loop runs once: packs, of up to 64 tokens each."""
+
 _SETTLE_S = 0.02
 """Seconds until the end of a token is believed: when a connection is lost, tokens end just before it."""
 
@@ -325,8 +341,14 @@ class TokenDebouncer:
     """
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, settled: Callable[[str, bool], None], refused: Callable[[], None]
+        self,
+        loop: asyncio.AbstractEventLoop,
+        settled: Callable[[str, bool], None],
+        refused: Callable[[], None],
+        most: int = TOKENS_MAX,
     ) -> None:
+        """`most`: keys that are remembered, of each kind."""
+        self._most = most
         self._loop = loop
         self._settled = settled
         self._refused = refused
@@ -338,7 +360,7 @@ class TokenDebouncer:
 
     def on_change(self, key: str, there: bool) -> None:
         """Note that a token appeared or ended."""
-        if not self._up:
+        if not self._up or key in self._early:
             self._changed_early(key, there)
         elif there:
             timer = self._going.pop(key, None)
@@ -365,11 +387,9 @@ class TokenDebouncer:
         return usable
 
     def on_up(self) -> None:
-        """Believe tokens from before the link was up."""
+        """Believe tokens from before the link was up: the first ones now, the others as the loop has time."""
         self._up = True
-        early, self._early = self._early, {}
-        for key in early:
-            self._settled(key, True)
+        self._settle_early()
 
     def on_down(self) -> None:
         """Ignore ends of tokens: with the link down or closed, they say nothing about their modules."""
@@ -379,10 +399,18 @@ class TokenDebouncer:
             timer.cancel()
         self._going.clear()
 
+    def _settle_early(self) -> None:
+        if self._up:
+            for key in list(itertools.islice(self._early, KEYS_PER_TURN)):
+                del self._early[key]
+                self._settled(key, True)
+            if self._early:
+                self._loop.call_soon(self._settle_early)
+
     def _changed_early(self, key: str, there: bool) -> None:
         if not there:
             self._early.pop(key, None)
-        elif key in self._early or len(self._early) < TOKENS_MAX:
+        elif key in self._early or len(self._early) < self._most:
             self._early[key] = None
         else:
             self._refused()
@@ -390,7 +418,7 @@ class TokenDebouncer:
     def _note_end(self, key: str) -> None:
         if self._went is not None:
             self._went.add(key)
-            if len(self._went) > TOKENS_MAX:  # too many to remember: the answers are of no use
+            if len(self._went) > self._most:  # too many to remember: the answers are of no use
                 self._went = None
 
     def _gone(self, key: str) -> None:

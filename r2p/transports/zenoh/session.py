@@ -38,6 +38,9 @@ _CHANNEL_MAX = 65_536
 that requests them, while it holds its locks, and would wait there for ever if they did not fit.
 """
 
+_TOKENS_MAX = 262_144
+"""Keys of tokens that wait likewise: twice those that a module keeps at most."""
+
 _PRIORITIES: dict[PublisherClass, zenoh.Priority] = {
     PublisherClass.NON_REAL_TIME: zenoh.Priority.DATA,
     PublisherClass.SPORADIC: zenoh.Priority.INTERACTIVE_HIGH,
@@ -60,9 +63,17 @@ class LoopQueue:
     """A queue from zenoh's threads into the event loop, which calls `handle` with each item, in order."""
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, handle: Callable[[Any], None], lost: LoggedCounter, *, most: int
+        self,
+        loop: asyncio.AbstractEventLoop,
+        handle: Callable[[Any], None],
+        lost: LoggedCounter,
+        *,
+        most: int,
+        per_turn: int = MESSAGES_PER_TURN,
     ) -> None:
+        """`most` items may wait; `per_turn` are handled before the loop runs once."""
         self._loop = loop
+        self._per_turn = per_turn
         self._handle = handle
         self._lost = lost
         self._most = most
@@ -92,7 +103,7 @@ class LoopQueue:
         # Cleared before the items are read: a later one schedules the next call.
         self._scheduled = False
         items = self._items
-        self._lost.drain(items, self._handle, MESSAGES_PER_TURN)
+        self._lost.drain(items, self._handle, self._per_turn)
         if items and not self._scheduled:  # a flood; other callbacks of the loop have their turn in between
             self._scheduled = True
             self._loop.call_soon(self._drain)
@@ -235,7 +246,7 @@ class ZenohSession:
             self.outbound.set_token_count(self._token_count)
             queue.put((liveliness.token_of(str(sample.key_expr)[start:]), there))
 
-        tokens: FifoChannel[zenoh.Sample] = FifoChannel(_CHANNEL_MAX)
+        tokens: FifoChannel[zenoh.Sample] = FifoChannel(_TOKENS_MAX)
         declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
         self.forward(declared, changed, queue)
 
@@ -246,9 +257,9 @@ class ZenohSession:
         start = len(prefix) + 1
 
         def query() -> bool:
-            if self._token_count > _CHANNEL_MAX // 2:  # they might not fit into the channel
+            if self._token_count > _TOKENS_MAX // 2:  # they might not fit into the channel
                 return False
-            replies: FifoChannel[zenoh.Reply] = FifoChannel(_CHANNEL_MAX)
+            replies: FifoChannel[zenoh.Reply] = FifoChannel(_TOKENS_MAX)
             complete = True
             for reply in self._session.liveliness().get(f"{prefix}/**", replies, timeout=timeout):
                 if reply.ok is None:  # the time is over
@@ -402,18 +413,19 @@ class ZenohSession:
     async def find_networks(self, *, tools: bool) -> set[str]:
         """Return the names of r2p networks with modules; failing that, with a publisher; failing that, with `tools`."""
 
-        def tokens(kind: str) -> list[tuple[str, str]]:
-            replies: FifoChannel[zenoh.Reply] = FifoChannel(_CHANNEL_MAX)
+        def keys(kind: str) -> list[tuple[str, str]]:
+            replies: FifoChannel[zenoh.Reply] = FifoChannel(_TOKENS_MAX)
             found = self._session.liveliness().get(f"r2p/*/{liveliness.KEY_PREFIX}/**/{kind}/**", replies, timeout=1.0)
             keys = [str(reply.ok.key_expr).split("/", 3) for reply in found if reply.ok is not None]
-            found_at = [(network, liveliness.token_of(key)) for _, network, _, key in keys if is_network_name(network)]
-            return [(network, token) for network, token in found_at if token.split("/")[2:3] == [kind]]
+            return [(network, liveliness.token_of(key)) for _, network, _, key in keys if is_network_name(network)]
 
         def find() -> set[str]:
-            modules = tokens("module")
-            found = {network for network, token in modules if liveliness.is_module(token)}
-            found = found or {network for network, _ in tokens("pub")}
-            return found or {network for network, _ in modules if tools}
+            modules = [*keys("module"), *keys(liveliness.PACKED)]
+            found = {network for network, key in modules if liveliness.is_module(key)}
+            found = found or {network for network, key in [*modules, *keys("pub")] if liveliness.has_publisher(key)}
+            if found or not tools:
+                return found
+            return {network for network, key in modules if liveliness.is_module(key, tools=True)}
 
         return await _in_thread(find)
 

@@ -56,7 +56,7 @@ class ZenohTransport(Transport):
         options = self._options
         config = build_config(options)
         connects = bool(connection_settings(config).endpoints)
-        link = ZenohLink(options.name, hub, connects=connects, batching=options.batching)
+        link = ZenohLink(options.name, hub, connects=connects, batching=options.batching, tokens_max=options.tokens)
         link.use_key(options.key)
         hub.attach(link)
         session = None

@@ -182,6 +182,19 @@ def test_a_token_that_is_refused_twice_in_a_look_does_not_need_room_for_two() ->
     assert count.next_deadline() == 15 * SECOND
 
 
+def test_a_pack_that_does_not_fit_is_not_asked_for_again_and_again() -> None:
+    count = session.RefusedTokens(100, 0)
+    count.add(7)
+    count.review(0, 7)
+    assert count.begin_query(count.next_deadline() or 0, 7)
+    count.add(7)  # somebody else was faster
+    count.query_ended(complete=True)
+    count.review(10 * SECOND, 6)
+    assert count.next_deadline() is None
+    count.review(10 * SECOND, 7)
+    assert count.next_deadline() is not None
+
+
 def test_modules_ask_one_by_one() -> None:
     due = set()
     for number in range(256):

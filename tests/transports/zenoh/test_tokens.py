@@ -1,11 +1,11 @@
 """Which tokens are believed, and when."""
 
 import asyncio
+from collections import Counter
 
 import pytest
 
-from r2p.transports.zenoh import link as tokens
-from r2p.transports.zenoh.link import TokenDebouncer
+from r2p.transports.zenoh.link import KEYS_PER_TURN, TokenDebouncer
 
 pytestmark = [pytest.mark.anyio, pytest.mark.virtual_time]
 
@@ -13,18 +13,25 @@ pytestmark = [pytest.mark.anyio, pytest.mark.virtual_time]
 class Believer:
     """Keeps what is believed."""
 
-    def __init__(self, *, up: bool = True) -> None:
+    def __init__(self, *, up: bool = True, most: int = 100) -> None:
         self.there: set[str] = set()
+        self.settled: Counter[str] = Counter()
         self.refused = 0
-        self.tokens = TokenDebouncer(asyncio.get_running_loop(), self._believed, self._count)
+        self.tokens = TokenDebouncer(asyncio.get_running_loop(), self._believed, self._count, most)
         if up:
             self.tokens.on_up()
 
     def _believed(self, key: str, there: bool) -> None:
         (self.there.add if there else self.there.discard)(key)
+        self.settled[key] += 1
 
     def _count(self) -> None:
         self.refused += 1
+
+
+async def turns() -> None:
+    for _ in range(10):
+        await asyncio.sleep(0)
 
 
 async def test_an_answer_that_is_older_than_the_end_of_its_token_is_not_believed() -> None:
@@ -54,9 +61,8 @@ async def test_answers_are_of_no_use_once_the_link_was_down() -> None:
     assert not believer.there
 
 
-async def test_answers_are_of_no_use_where_too_many_tokens_go_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tokens, "TOKENS_MAX", 4)
-    believer = Believer()
+async def test_answers_are_of_no_use_where_too_many_tokens_go_meanwhile() -> None:
+    believer = Believer(most=4)
     believer.tokens.begin_query()
     for number in range(5):
         believer.tokens.on_change(f"{number}", False)
@@ -65,10 +71,39 @@ async def test_answers_are_of_no_use_where_too_many_tokens_go_meanwhile(monkeypa
     assert not believer.there
 
 
-async def test_what_has_no_room_before_the_link_is_up_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tokens, "TOKENS_MAX", 2)
-    believer = Believer(up=False)
+async def test_what_has_no_room_before_the_link_is_up_is_counted() -> None:
+    believer = Believer(up=False, most=2)
     for key in ("a", "b", "b", "c", "d"):
         believer.tokens.on_change(key, True)
     believer.tokens.on_up()
     assert (believer.there, believer.refused) == ({"a", "b"}, 2)
+
+
+async def test_many_tokens_from_before_the_link_was_up_are_believed_in_turns() -> None:
+    """Those that end before their turn were never there, and those that are told again count once."""
+    believer = Believer(up=False)
+    keys = [f"{number}" for number in range(50)]
+    for key in keys:
+        believer.tokens.on_change(key, True)
+    believer.tokens.on_up()
+    assert believer.there == set(keys[:KEYS_PER_TURN])
+    believer.tokens.on_change(keys[40], False)
+    believer.tokens.on_change(keys[41], True)
+    believer.tokens.on_change("new", True)
+    await turns()
+    assert believer.there == {*keys, "new"} - {keys[40]}
+    assert believer.settled[keys[41]] == 1
+
+
+async def test_tokens_whose_turn_has_not_come_wait_while_the_link_is_down_again() -> None:
+    believer = Believer(up=False)
+    for number in range(50):
+        believer.tokens.on_change(f"{number}", True)
+    believer.tokens.on_up()
+    believer.tokens.on_down()
+    believer.tokens.on_change("49", False)
+    await turns()
+    assert len(believer.there) == KEYS_PER_TURN
+    believer.tokens.on_up()
+    await turns()
+    assert believer.there == {f"{number}" for number in range(49)}

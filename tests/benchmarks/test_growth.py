@@ -1,0 +1,95 @@
+"""How the cost grows, in operations that are counted instead of time; and the picture for the documentation."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+import pytest
+
+from benchmarks.growth import draw, router_mesh, zenoh_network
+from benchmarks.growth.curve import Curve, exponent
+from benchmarks.growth.router_mesh import Sent
+from r2p.codecs import liveliness
+from r2p.protocols.liveliness.session import LivelinessDiscovery
+
+
+def calls(function: Callable[[], object]) -> int:
+    """Return how many functions in Python are called."""
+    count = 0
+
+    def profile(frame: FrameType, event: str, argument: object) -> None:
+        nonlocal count
+        count += event == "call"
+
+    sys.setprofile(profile)
+    try:
+        function()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+def test_the_exponent_is_the_slope_of_the_logarithms() -> None:
+    assert exponent([(n, 3 * n**1.5) for n in (1, 10, 100)]) == pytest.approx(1.5)
+    assert exponent([(10, 5.0), (100, 5.0)]) == pytest.approx(0.0)
+    assert exponent([(10, 5.0), (10, 6.0)]) is None
+    assert exponent([(10, 0.0), (100, 5.0)]) is None
+
+
+def test_a_module_that_joins_a_network_works_in_proportion_to_its_size() -> None:
+    points = []
+    for modules in (5, 15, 40):
+        keys = [liveliness.token_of(key.removeprefix("live/")) for key in zenoh_network.keys(modules)]
+        joins = LivelinessDiscovery("JOINS", 0xFFFF)
+        joins.link_up(0)
+        liveliness.tokens_of.cache_clear()
+
+        def join(joins: LivelinessDiscovery = joins, keys: list[str] = keys) -> None:
+            for key in keys:
+                joins.appeared(0, key)
+
+        points.append((modules, calls(join)))
+        assert len(joins.topics) == modules * 10
+    power = exponent(points)
+    assert power is not None
+    assert 0.95 < power < 1.05
+
+
+def test_keys_grow_with_modules_and_one_change_is_one_key() -> None:
+    assert exponent([(n, len(zenoh_network.keys(n))) for n in (3, 30)]) == pytest.approx(1.0)
+    assert len(zenoh_network.keys(3)) == 6
+
+
+def test_time_at_rest_is_nothing() -> None:
+    """Nothing is due in a network where nothing changes, however large it is."""
+    joins = LivelinessDiscovery("JOINS", 0xFFFF)
+    joins.link_up(0)
+    joins.poll(0)
+    for key in zenoh_network.keys(20):
+        joins.appeared(0, liveliness.token_of(key.removeprefix("live/")))
+    assert len(joins.topics) == 200
+    assert joins.next_deadline() is None
+
+
+def test_until_each_message_comes_once() -> None:
+    def sent(*numbers: int) -> list[Sent]:
+        return [Sent(number=number, at=number * 10_000_000) for number in numbers]
+
+    assert router_mesh.until_each_once(sent(1, 2, 3, 4)) == 0.0
+    assert router_mesh.until_each_once(sent(1, 2, 12, 13)) == pytest.approx(0.11)
+    assert router_mesh.until_each_once(sent(1, 2, 12, 12, 13, 14)) == pytest.approx(0.11)
+    assert router_mesh.until_each_once(sent(1, 5, 6, 8, 9)) == pytest.approx(0.07)
+
+
+def test_a_curve_without_a_goal_or_a_value_is_not_drawn(tmp_path: Path) -> None:
+    curves = [
+        Curve("drawn", "modules", "s", [(10, 1.0), (100, 10.0)], goal=20.0),
+        Curve("without a goal", "modules", "s", [(10, 1.0)]),
+        Curve("nothing lost", "modules", "%", [(10, 0.0)], goal=0.0),
+    ]
+    draw.draw(curves).write(tmp_path / "growth.svg")
+    text = (tmp_path / "growth.svg").read_text()
+    assert "drawn, N^1.00" in text
+    assert "without a goal" not in text
+    assert "nothing lost" not in text
