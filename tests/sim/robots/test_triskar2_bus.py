@@ -85,7 +85,7 @@ async def sink(node: r2p.Node) -> None:
     await asyncio.Event().wait()
 
 
-async def run(traffic: Traffic, *, loaded: bool, seconds: float = 8.0) -> Run:
+async def run(traffic: Traffic, *, loaded: bool, seconds: float = 4.0) -> Run:
     """A drive, with the bus filled to 150 % from half of the time on."""
     starts: list[int] = []
     errors: list[float] = []
@@ -124,47 +124,56 @@ def test_load_does_not_move_hard_real_time_by_a_nanosecond_and_does_move_the_res
     without = sim.run(functools.partial(run, "nrt", loaded=True))
     assert quiet.load + 2 * BLOBS * FRAME / 500_000 > 1.5
     assert loaded.load > 0.75  # what is lost by arbitration is not sent again at once
-    assert len(quiet.starts) > 1000
+    assert len(quiet.starts) > 500
     assert loaded.starts == quiet.starts
     assert math.dist(loaded.pose[:2], quiet.pose[:2]) < 1e-3
     assert without.error >= 5 * loaded.error
 
 
 MANAGEMENT = 390
-"""The most frames per second with which the robot and a PC stay known to each other, including the start."""
+"""The most frames per second with which the robot and a PC stay known to each other, once they have met."""
+START = 3200
+"""The most in the first five seconds, in which they meet."""
 
 
-async def test_a_minute_of_squares() -> None:
-    """As on the network in memory; all hops of the chain but the PC's are sent as the nodes choose."""
+def management_frames() -> int:
+    """Those that the bus has carried so far."""
+    carried = sim.can_bus("robot").bus.statistics.by_message
+    return sum(count.frames for message, count in carried.items() if message >> 8 == rtcan.MANAGEMENT)
+
+
+async def test_a_lap_of_the_square() -> None:
+    """As on the network in memory, where it drives three; all hops but the PC's are sent as the nodes choose."""
     async with Triskar2(BUS, seed=1) as robot, r2p.Module("PC1", via=BUS) as pc, odometry_of(pc) as odometry:
-        pc.start(functools.partial(square, side=1.5, speed=0.4, laps=3, wait=WAIT), name="square")
-        await asyncio.sleep(60)
-        carried = sim.can_bus("robot").bus.statistics.by_message
-        management = sum(count.frames for message, count in carried.items() if message >> 8 == rtcan.MANAGEMENT)
-        assert management / 60 < MANAGEMENT
+        pc.start(functools.partial(square, side=1.5, speed=0.4, laps=1, wait=WAIT), name="square")
+        await asyncio.sleep(5)
+        start = management_frames()
+        await asyncio.sleep(18)
+        assert start < START
+        assert (management_frames() - start) / 18 < MANAGEMENT
         told = (await odometry.fetch(1)).pose
         x, y, _ = robot.pose
         path = robot.hardware.body.path
-        assert path == pytest.approx(18, rel=0.03)
+        assert path == pytest.approx(6, rel=0.03)
         assert math.hypot(told.x - x, told.y - y) < 0.02 * path
         assert math.hypot(x, y) < 0.03 * path
 
 
 async def recorded(seed: int) -> list[FrameRecord]:
-    """All frames of five seconds of a drive, with their times."""
+    """All frames of the start of a drive, with their times."""
     frames: list[FrameRecord] = []
     bus = sim.can_bus("robot")  # it lives as long as it is held
     bus.bus.observers.append(frames.append)
     world = World([((0.6, -5.0), (0.6, 5.0)), ((-0.6, -5.0), (-0.6, 5.0))])  # something to see
     async with Triskar2(BUS, seed=seed, world=world), r2p.Module("PC1", via=BUS) as pc:
         pc.start(square)
-        await asyncio.sleep(5)
+        await asyncio.sleep(2.5)
     return frames
 
 
 def test_the_same_seed_gives_the_same_bits_at_the_same_nanoseconds() -> None:
     one, same, other = (sim.run(functools.partial(recorded, seed), seed=7) for seed in (1, 1, 2))
-    assert len(one) > 2000
+    assert len(one) > 1000
     assert one == same
     assert [record.frame for record in one] != [record.frame for record in other]
 
