@@ -32,15 +32,27 @@ async def _publish(node: r2p.Node) -> None:
 
 
 async def _robot(pipe: Connection) -> None:
-    """Run a router, and the modules."""
+    """Run a router, and the modules: each begins when the one before it has announced its topics.
+
+    All at once they keep a core busy for longer than the second after which zenoh takes a silent session for gone, and
+    then they connect and announce anew, again and again.
+    """
     async with AsyncExitStack() as stack:
         router = r2p.Module("ROUTER", via=zenoh.LISTEN.replace("peer", "router"), watchdog=False)
         port = zenoh.port_of(await stack.enter_async_context(router))
         for number in range(MODULES):
             module = r2p.Module(f"MODULE{number}", via=zenoh.connect(port), watchdog=False)
             (await stack.enter_async_context(module)).start(_publish)
+            while not _knows(router, module.name):  # noqa: ASYNC110 - there is no event
+                await asyncio.sleep(0.05)
         pipe.send(port)
         await asyncio.get_running_loop().create_future()
+
+
+def _knows(router: r2p.Module, module: str) -> bool:
+    """Return whether a module knows all topics of another one, with the nodes that publish them."""
+    published = router.network.nodes().get((module, "_publish"), ([], []))[0]
+    return len(published) >= TOPICS
 
 
 def run_robot(pipe: Connection) -> None:

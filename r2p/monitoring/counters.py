@@ -188,7 +188,8 @@ class ModuleCounters:
             key = each.node, each.topic
             count = counts[key] = self.subscribers.get(key) or SubscriberCount()
             count.waiting = each.waiting
-            count.lost = _subscriber_losses(each)
+            has_lost = each.lost or each.undecodable or each.too_long or each.stale
+            count.lost = _subscriber_losses(each) if has_lost else _NONE
         self._note_endpoints(self.subscribers, counts)
         self.subscribers = counts
 

@@ -123,6 +123,7 @@ class TopicRow:
         "_is_of_service",
         "_publishers",
         "_sources",
+        "_subscriber_figures",
         "_subscribers",
         "_view",
         "row",
@@ -138,6 +139,7 @@ class TopicRow:
         self._is_of_service = is_of_service
         self._publishers = [(each, _class_name(each), self._publisher_count(each)) for each in view.publishers]
         self._subscribers = [(each, self._subscriber_count(each)) for each in view.subscribers]
+        self._subscriber_figures = [_subscriber(*each) for each in self._subscribers]
         # One of each node, however many links it is seen on; and firmware, which does not say which node it is.
         counts = {(each.module, each.node): count for each, _, count in self._publishers}
         self._counted = [count for count in counts.values() if count is not None]
@@ -170,11 +172,13 @@ class TopicRow:
             view.mismatch,
             None if view.age is None else view.age // _AGE_STEP * _AGE_STEP,
             [_publisher(*each) for each in self._publishers],
-            [_subscriber(*each) for each in self._subscribers],
+            self._newest_subscribers(),
             laxity=sources.laxity.get(name),
             is_of_service=self._is_of_service,
         )
-        if self._counted:
+        if len(self._counted) == 1:  # as almost all topics have
+            figures.missed, figures.late = self._counted[0].missed, self._counted[0].late
+        elif self._counted:
             figures.missed = clamp(sum([each.missed for each in self._counted]))
             figures.late = clamp(sum([each.late for each in self._counted]))
         if self._any_counted:
@@ -184,6 +188,14 @@ class TopicRow:
             _enter_measured(figures, measured)
         self._enter_rate(figures, measured)
         return figures
+
+    def _newest_subscribers(self) -> list[SubscriberFigures]:
+        """Return the figures of subscribers: the same list as before, if nothing has changed."""
+        for (_, count), known in zip(self._subscribers, self._subscriber_figures, strict=True):
+            if count is not None and (count.waiting != known.waiting or count.lost != known.lost):
+                self._subscriber_figures = [_subscriber(*each) for each in self._subscribers]
+                break
+        return self._subscriber_figures
 
     def _enter_rate(self, figures: TopicFigures, measured: MeasuredTopic | None) -> None:
         """Enter the rate, by the best of its sources, and the bandwidth."""
