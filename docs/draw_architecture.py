@@ -35,7 +35,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "Gateways": ("bridge",),
     "Links": ("transports", "transports.can", "transports.rtcan", "transports.zenoh"),
     "Nodes and topics": ("runtime", "runtime.publishers", "services", "parameters"),
-    "Protocols, pure": (
+    "Protocols and analysis, pure": (
+        "analysis",
         "protocols",
         "protocols.discovery",
         "protocols.liveliness",

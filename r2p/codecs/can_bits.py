@@ -93,14 +93,18 @@ ARBITRATION_FIELDS |= {FrameField.EXTENSION, FrameField.REMOTE}
 """Where a controller that sends a recessive bit and sees a dominant one loses the arbitration."""
 
 
-def frame_bits_min(size: int) -> int:
+def frame_bits_min(size: int, *, extended: bool = True) -> int:
     """Return the bits of the shortest frame with `size` bytes of data: no stuff bits. Without intermission."""
-    return _HEADER + 8 * size + _CRC + TAIL
+    return (_HEADER if extended else _STANDARD_HEADER) + 8 * size + _CRC + TAIL
 
 
-def frame_bits_max(size: int) -> int:
-    """Return the bits of the longest frame with `size` bytes of data: after the first bit, one stuffed in per four."""
-    return frame_bits_min(size) + (_HEADER + 8 * size + _CRC - 1) // 4
+def frame_bits_max(size: int, *, extended: bool = True) -> int:
+    """Return the bits of the longest frame with `size` bytes of data: after the first bit, one stuffed in per four.
+
+    Both are of a data frame with a 29-bit identifier, or an 11-bit one if it is not `extended`.
+    """
+    shortest = frame_bits_min(size, extended=extended)
+    return shortest + (shortest - TAIL - 1) // 4
 
 
 @lru_cache(maxsize=64)  # all that deal with one frame ask at about the same time

@@ -30,7 +30,7 @@ GROUPS = {
     "app": ("r2p.tools.app", "List, load, remove and start the apps of a firmware module."),
     "msg": ("r2p.tools.msg", "Show message types, and exchange them with C and ROS."),
     "bag": ("r2p.tools.bag", "Record topics to a file, and play, inspect and convert it."),
-    "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots. Serve a simulated one."),
+    "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots, worst cases. Serve a simulated one."),
     "key": ("r2p.tools.key", "Make a shared key for links."),
     "config": ("r2p.tools.config_show", "Show the settings, and where they come from."),
 }

@@ -7,6 +7,7 @@ A block is what stands between two fences. Its language says how it is tested:
 | python | executed under virtual time, in a namespace of its own; and type-checked |
 | console | `$ command`, then what it prints: run in a shell of the page, in the page's order |
 | toml | parsed |
+| csv | a file for the commands of its page |
 | json5 | a configuration of zenoh: loaded, and tried in `test_zenoh` |
 | text, c, ini | not tested, unless a note says so |
 
@@ -39,7 +40,7 @@ from pathlib import Path
 import msgspec
 
 ROOT = Path(__file__).parents[2]
-LANGUAGES = {"python", "console", "toml", "json5", "text", "c", "hex", "ini"}
+LANGUAGES = {"python", "console", "toml", "csv", "json5", "text", "c", "hex", "ini"}
 NOTES = {"continues", "output", "pytest", "frames", "recorded", "keeps running", "exits", "not run", "compiled"}
 
 _FENCE = re.compile(

@@ -25,7 +25,7 @@ PORTS = ("2323", "2324", "2325", "2326", "8080", "8765")
 ROBOT = "192.168.0.10:23"
 DEVICE = "/dev/ttyUSB0"
 
-_RUN = {"console", "toml", "python", "hex"}
+_RUN = {"console", "toml", "csv", "python", "hex"}
 
 
 @contextlib.contextmanager

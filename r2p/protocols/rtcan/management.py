@@ -19,8 +19,8 @@ from r2p.protocols.rtcan.transmitter import SlotTransmitter
 from r2p.units import LONG_AGO, MILLISECOND, NEVER
 
 # Deadlines, in ns.
-_DEADLINE = 50_000_000
-_CONTROL = 10_000_000  # of what keeps the network: slots must not wait for all that discovery has to say
+DEADLINE = 50_000_000
+CONTROL_DEADLINE = 10_000_000  # of what keeps the network: slots must not wait for all that discovery has to say
 _URGENT = MILLISECOND
 
 QUIET = 33_000_000
@@ -108,12 +108,12 @@ class ManagementSender:
         if self._detector.profile is Profile.FIRMWARE:
             self.send_bytes(now, data)
         else:
-            self._enqueue(now, self._message_id(), data, None, _CONTROL)
+            self._enqueue(now, self._message_id(), data, None, CONTROL_DEADLINE)
 
     def send_bytes(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> None:
         """Send a message; before the others, if it is urgent."""
         if self._detector.profile is not Profile.FIRMWARE:
-            self._enqueue(now, self._message_id(), data, handle, _URGENT if urgent else _DEADLINE)
+            self._enqueue(now, self._message_id(), data, handle, _URGENT if urgent else DEADLINE)
             return
         dropped = self.limiter.put(data, urgent=urgent, handle=handle)
         self._context.report(dropped, Fate.FULL, missed=False, at=now)
@@ -122,14 +122,14 @@ class ManagementSender:
         """Among firmware: send the next message if the bus is quiet."""
         due = self.limiter.pop(now)
         if due is not None:
-            self._enqueue(now, rtcan.FIRMWARE_MANAGEMENT, *due, _DEADLINE)
+            self._enqueue(now, rtcan.FIRMWARE_MANAGEMENT, *due, DEADLINE)
 
     def _message_id(self) -> int:
         return rtcan.message_id(rtcan.MANAGEMENT, self._node_id.id8)
 
     def _enqueue(self, now: int, message: int, data: bytes, handle: Hashable, within: int) -> None:
         outgoing = QueuedMessage(message, data, now + within, drop=False, handle=handle)
-        if self._transmitter.queue.put(outgoing, urgent=within < _DEADLINE, management=True):
+        if self._transmitter.queue.put(outgoing, urgent=within < DEADLINE, management=True):
             self._transmitter.reschedule(now)
         else:
             self._context.counts["management dropped"] += 1

@@ -1,0 +1,185 @@
+"""`r2p bus analyze`: its reports, what it refuses, and what it measures on a bus."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+import r2p
+from r2p.analysis.dbc import read_dbc
+from r2p.bus import BusMonitor
+from r2p.msg import Led
+from r2p.sim import SimCan, run
+from r2p.sim.can import CanNode
+from r2p.sim.transport import SimPort
+from r2p.testing.network import node_in
+from r2p.tools.bus import app
+from r2p.tools.bus.live import LiveBus, watch
+
+SETS = Path(__file__).parents[2] / "golden" / "sets"
+ROBOT = """
+[bus]
+slots = 60
+
+[[message]]
+name = "speed"
+node = "DCM"
+class = "hrt"
+bytes = 18
+period = "1ms"
+
+[[message]]
+name = "bumper"
+node = "BUMP"
+class = "srt"
+bytes = 8
+period = "50ms"
+deadline = "20ms"
+
+[[message]]
+name = "log"
+node = "DCM"
+class = "nrt"
+bytes = 64
+"""
+
+
+def analyze(*arguments: str) -> tuple[int, list[dict[str, Any]], str]:
+    result = CliRunner().invoke(app, ["analyze", *arguments])
+    return result.exit_code, [json.loads(line) for line in result.stdout.splitlines()], result.stderr
+
+
+def robot(tmp_path: Path, text: str = ROBOT) -> str:
+    path = tmp_path / "robot.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_a_set_whose_deadlines_hold() -> None:
+    code, rows, error = analyze(str(SETS / "broster12_250k.csv"), "--bitrate", "250000", "--fault-rate", "30")
+    assert (code, error) == (0, "")
+    assert rows[0] == {
+        "name": "b1",
+        "node": "n1",
+        "class": "can",
+        "id": "0x1",
+        "bytes": 8,
+        "period_ms": 10.0,
+        "deadline_ms": 10.0,
+        "jitter_ms": 0.0,
+        "bound_ms": 1.028,
+        "result": "in time",
+        "p_late": pytest.approx(0.0, abs=1e-9),
+    }
+    assert [row["bound_ms"] for row in rows[-2:]] == [4.708, 4.72]
+    faulty = analyze(str(SETS / "broster12_250k.csv"), "--bitrate", "250000", "--faults", "2")[1]
+    assert faulty[0]["bound_ms"] == 1.028 + 2 * 0.644
+
+
+def test_a_deadline_that_may_be_missed_is_exit_code_1() -> None:
+    code, rows, error = analyze(str(SETS / "davis_counterexample_125k.csv"), "--bitrate", "125000")
+    assert code == 1
+    assert [row["result"] for row in rows] == ["in time", "in time", "late"]
+    assert "1 of 3 messages may be late: C" in error
+    code, [summary], _ = analyze(str(SETS / "davis_counterexample_125k.csv"), "--bitrate", "125000", "--summary")
+    assert (code, summary["load"], summary["breakdown_scale"]) == (1, 0.9714, 0.993)
+
+
+def test_messages_with_classes_are_those_of_rtcan(tmp_path: Path) -> None:
+    code, rows, _ = analyze(robot(tmp_path))
+    assert code == 0
+    assert [(row["name"], row["result"]) for row in rows] == [
+        ("speed", "in time"),
+        ("bumper", "in time"),
+        ("log", "no bound"),
+    ]
+    assert rows[0]["bound_ms"] == (2 * 166 + 157) / 1000
+    alone = analyze(robot(tmp_path), "--no-control")[1]
+    assert alone[1]["bound_ms"] < rows[1]["bound_ms"]
+    [summary] = analyze(robot(tmp_path), "--summary", "--jitter", "3us")[1]
+    assert (summary["order"], summary["slot_us"], summary["guard_us"]) == ("any", 166.0, 6.0)
+    assert summary["guard_needed_us"] == 12.996
+    assert summary["smallest_slot_us"] == 177.0
+
+
+def test_a_message_without_slots_is_late_and_says_why(tmp_path: Path) -> None:
+    crowd = "".join(
+        f'[[message]]\nname = "m{number}"\nclass = "hrt"\nbytes = 24\nperiod = "1ms"\n' for number in range(2)
+    )
+    code, rows, error = analyze(robot(tmp_path, crowd))
+    assert (code, rows[1]["bound_ms"]) == (1, None)
+    assert rows[1]["result"] == "no 3 slots in a row are free every 6 slots"
+    assert "1 of 2 messages may be late: m1" in error
+
+
+def test_the_messages_go_into_a_dbc_file_and_out_of_it(tmp_path: Path) -> None:
+    target = tmp_path / "net.dbc"
+    assert analyze(robot(tmp_path), "--dbc", str(target))[0] == 0
+    found = read_dbc(target.read_text(encoding="utf-8"))
+    assert (found.bitrate, [each.name for each in found.messages]) == (1_000_000, ["speed", "bumper", "log"])
+    assert analyze(str(target))[1] == analyze(robot(tmp_path))[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "reason"),
+    [
+        ([], 2, "give a FILE with messages, or --via"),
+        (["a.csv", "--via", "rtcan:can0"], 2, "give a FILE with messages, or --via"),
+        (["a.xml"], 2, "ends with .csv, .toml, .dbc"),
+        (["missing.csv"], 1, "can't read missing.csv"),
+    ],
+)
+def test_what_can_not_be_read(
+    arguments: list[str], code: int, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["analyze", *arguments])
+    assert result.exit_code == code
+    assert reason in " ".join(result.stderr.replace("│", "").split())
+
+
+def test_a_bad_file_says_which_and_why(tmp_path: Path) -> None:
+    path = tmp_path / "net.csv"
+    path.write_text("name,bytes\na,9\n", encoding="utf-8")
+    code, _, error = analyze(str(path))
+    assert code == 1
+    assert f"{path}: a: 9 bytes: a frame has up to 8" in " ".join(error.split())
+
+
+def test_a_live_bus_is_measured() -> None:
+    async def main() -> LiveBus:
+        can = SimCan(seed=1)
+        listener = SimPort(can, CanNode("listener", listen_only=True))
+        a, b = (r2p.Module(name, via=can.transport(), watchdog=False) for name in "AB")
+        async with a, b, node_in(a) as sender, node_in(b) as receiver:
+            watching = asyncio.create_task(_watched(listener))
+            leds = sender.advertise("leds", Led, r2p.Sporadic(deadline=0.020))
+            speed = sender.advertise("speed", Led, r2p.Periodic(period=0.010, fill=lambda: Led(led=1)))
+            receiver.subscribe("leds", Led)
+            receiver.subscribe("speed", Led)
+            await asyncio.sleep(4)
+            await speed.ready(5)
+            for _ in range(60):
+                await leds.publish(Led(led=2))
+                await asyncio.sleep(0.050)
+            return await watching
+
+    async def _watched(listener: SimPort) -> LiveBus:
+        async with BusMonitor(listener) as bus:
+            return await watch(bus, 6.0)
+
+    live = run(main())
+    declared = {each.name: each for each in live.declared}
+    assert {"leds", "speed"} <= declared.keys()
+    leds, speed = declared["leds"], declared["speed"]
+    assert (leds.message_class.value, leds.size, leds.deadline) == ("srt", 5, 19_000_000)
+    assert leds.period == pytest.approx(50_000_000, rel=0.02)
+    assert (speed.message_class.value, speed.size) == ("hrt", 5)
+    assert speed.period == pytest.approx(9_960_000, abs=20_000)
+    assert live.supply.share == pytest.approx(58 / 60)
+    assert {each.node for each in live.control} <= {"A", "B"}
