@@ -257,7 +257,7 @@ def _periodic(message: BusMessage, timing: Timing, accuracy: SlotAccuracy, refus
 
 async def _print(report: Report, output: Output, *, summary: bool) -> None:
     if summary:
-        await output.put(report.summary)
+        await output.put(report.summary, _in_words(report.summary))
     else:
         columns = [*_COLUMNS, "p_late"] if report.chances else _COLUMNS
         await output.table([_row(each, report) for each in report.bounds], columns)
