@@ -34,6 +34,7 @@ ALL = (
     "admission",
     "simulated_can",
     "timers",
+    "slots_on_pcs",
     "playing",
     "dash",
     "browser",

@@ -15,7 +15,7 @@ Since slot 0 of every cycle is the sync's, the slots of one occurrence never spa
 import enum
 import math
 from collections.abc import Iterator
-from itertools import islice
+from itertools import islice, pairwise
 
 import msgspec
 
@@ -115,8 +115,10 @@ class Calendar:
     def admit(
         self, message: int, period: int, fragments: int = 1, *, round_down: bool = False
     ) -> Reservation | Refusal:
-        """Reserve slots, at the phase that leaves most to others, or the least one by the harmonic rule.
+        """Reserve slots, at the phase that leaves most to others.
 
+        The least phase by the harmonic rule, and with `round_down` while all periods are harmonic: then the topics of a
+        control loop, which ask one after another, have slots one after another, and little time passes between them.
         `round_down`: with the longest possible period up to this one that divides the cycle or is a multiple of it,
         else with this one. A message that has slots of another period or size gives those back first.
         """
@@ -125,7 +127,7 @@ class Calendar:
         for wanted in self._candidates(period, round_down):
             if before is not None and (before.period, before.fragments) == (wanted, fragments):
                 return self._enter(before)
-            outcome = self._place(message, wanted, fragments)
+            outcome = self._place(message, wanted, fragments, least=round_down and self._is_harmonic(wanted))
             if isinstance(outcome, Reservation):
                 return self._enter(outcome)
             refusals.append(outcome)
@@ -179,18 +181,23 @@ class Calendar:
         yield from (divisor for divisor in range(min(period, self.slots - 1), 1, -1) if self.slots % divisor == 0)
         yield period
 
-    def _place(self, message: int, period: int, fragments: int) -> Reservation | Refusal:
+    def _is_harmonic(self, period: int) -> bool:
+        """Return whether of every two periods, this one included, one divides the other."""
+        periods = sorted({self.slots, period, *(each.period for each in self._entries.values())})
+        return all(longer % shorter == 0 for shorter, longer in pairwise(periods))
+
+    def _place(self, message: int, period: int, fragments: int, *, least: bool) -> Reservation | Refusal:
         if (refusal := self._impossible(message, period, fragments)) is not None:
             return refusal
         starts = _starts(self.free(period), fragments)
         if not starts:
             return Refusal(message, RefuseReason.FULL, period, fragments)
+        if least or self.rule is PeriodRule.HARMONIC:
+            return Reservation(message, period, next(_set_bits(starts)), fragments)
         return Reservation(message, period, self._phase(starts, period, fragments), fragments)
 
     def _phase(self, starts: int, period: int, fragments: int) -> int:
         """Return the phase of those possible that takes the least from others; the least one of equal phases."""
-        if self.rule is PeriodRule.HARMONIC:
-            return next(_set_bits(starts))
         losses = self._losses(period, fragments)
         return min(
             islice(_set_bits(starts), _PHASES_MAX),
@@ -231,6 +238,12 @@ class Calendar:
         if self.rule is PeriodRule.HARMONIC:
             return RefuseReason.OTHER
         return RefuseReason.FACTOR if factor < fragments + others else None
+
+
+def asked_exactly(interval: int, slot: int, slots: int) -> bool:
+    """Return whether an owner asks for just this interval (ns) first: whole slots that would be rounded down."""
+    period, rest = divmod(interval, slot)
+    return not rest and math.gcd(period, slots) not in (period, slots)
 
 
 def occupied(reservation: Reservation, start: int, slots: int) -> int:

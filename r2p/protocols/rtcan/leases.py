@@ -16,7 +16,7 @@ import msgspec
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import NO_PHASE, Grant, Refuse, RefuseReason, Renew, Renewed, Reserve
-from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
+from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, asked_exactly, occupied
 from r2p.protocols.rtcan.cycle import Timing, following
 from r2p.protocols.rtcan.events import Due, EngineContext, SlotsGranted, SlotsLost, SlotsRefused
 from r2p.units import LONG_AGO, MILLISECOND, SECOND
@@ -229,7 +229,7 @@ class SlotRequests:
 
     def start(self, now: int, periodic: PeriodicMessage) -> None:
         """Request slots, and let the message go without until they are granted."""
-        periodic.exact = self._is_whole(periodic)
+        periodic.exact = asked_exactly(periodic.interval, self._cycle.timing.slot, self._cycle.timing.slots)
         self.schedule(now, periodic)
         self._start_ticking(now, periodic)
 
@@ -252,7 +252,7 @@ class SlotRequests:
         """Request slots, now that there is a master."""
         self.has_master = True
         for each in self._periodics.values():
-            each.exact = self._is_whole(each)
+            each.exact = asked_exactly(each.interval, self._cycle.timing.slot, self._cycle.timing.slots)
             self.schedule(now, each)
 
     def pause(self, now: int, reason: str) -> None:
@@ -381,12 +381,6 @@ class SlotRequests:
             periodic.restart()
             self._plan.invalidate()
             self._actions.append(SlotsLost(periodic.high, reason))
-
-    def _is_whole(self, periodic: PeriodicMessage) -> bool:
-        """Return whether the interval is a number of slots that would be rounded down: else this is no matter."""
-        period, rest = divmod(periodic.interval, self._cycle.timing.slot)
-        slots = self._cycle.timing.slots
-        return not rest and math.gcd(period, slots) not in (period, slots)
 
     def _start_ticking(self, now: int, periodic: PeriodicMessage) -> None:
         if ("tick", periodic.high) not in self._timers:

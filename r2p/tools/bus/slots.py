@@ -18,6 +18,7 @@ import typer
 import r2p
 from r2p.bus import BusMonitor, BusSlot, Calendar, PeriodRule, Refusal, Reservation, Timing, timing
 from r2p.codecs import rtcan
+from r2p.protocols.rtcan.calendar import asked_exactly
 from r2p.tools.options import Format, hertz, seconds, time_option
 from r2p.tools.output import Output, Record
 from r2p.tools.session import TimedOut, execute
@@ -220,10 +221,10 @@ def admit_all(calendar: Calendar, plan: list[Wanted], grid: Timing) -> list[Rese
     """Admit the messages in order, as their owners ask for slots; message ids are their indices."""
     results = []
     for i, each in enumerate(plan):
-        period, rest = divmod(each.interval, grid.slot)
-        fragments = rtcan.fragment_count(each.size)
-        result = calendar.admit(i, period, fragments, round_down=bool(rest))
-        if isinstance(result, Refusal) and not rest:
+        period, fragments = each.interval // grid.slot, rtcan.fragment_count(each.size)
+        exactly = asked_exactly(each.interval, grid.slot, grid.slots)
+        result = calendar.admit(i, period, fragments, round_down=not exactly)
+        if isinstance(result, Refusal) and exactly:
             result = calendar.admit(i, period, fragments, round_down=True)
         results.append(result)
     return results

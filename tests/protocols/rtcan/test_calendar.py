@@ -62,6 +62,20 @@ def test_the_phase_that_leaves_most() -> None:
     assert sorted(admitted(calendar, message, 6).phase for message in range(11, 16)) == [1, 2, 3, 4, 5]
 
 
+def test_topics_of_a_control_loop_are_next_to_each_other() -> None:
+    """While all periods are harmonic, and rounded: what asks next comes next on the bus."""
+    calendar = Calendar(60)
+    phases = []
+    for message, period in enumerate((60, 30, 65, 60)):
+        outcome = calendar.admit(message, period, round_down=True)
+        assert isinstance(outcome, Reservation)
+        phases.append(outcome.phase)
+    assert phases == [1, 2, 3, 4]
+    admitted(calendar, 9, 90)
+    spread = calendar.admit(10, 6, round_down=True)
+    assert isinstance(spread, Reservation)
+
+
 def test_fragments_take_slots_in_a_row() -> None:
     calendar = Calendar(12, HARMONIC)
     assert admitted(calendar, 1, 12, 3).phase == 1
