@@ -74,6 +74,12 @@ class TokenBucket:
         """Return when `count` messages may go (ns)."""
         return self._full_at + count * self.gap - self._slack
 
+    def changed(self, rate: float, burst: int) -> "TokenBucket":
+        """Return one of another rate and burst that owes what this one does."""
+        bucket = TokenBucket(rate, burst)
+        bucket._full_at = self._full_at
+        return bucket
+
     def spend(self, now: int, count: int) -> None:
         self._full_at = max(self._full_at, now) + count * self.gap
 
@@ -82,7 +88,8 @@ class Schedule:
     """Chooses the next announcement and its time. Each call costs the same, however much there is to repeat."""
 
     def __init__(self, rate: float, burst: int, quiet: int) -> None:
-        self.set_pace(rate, burst, quiet)
+        self._bucket = TokenBucket(rate, max(burst, _ITEM_MESSAGES))
+        self._quiet = quiet
         self._fresh: OrderedDict[Item, None] = OrderedDict()
         self._ring: OrderedDict[Item, None] = OrderedDict()
         self._slow: OrderedDict[Item, None] = OrderedDict()
@@ -99,10 +106,15 @@ class Schedule:
         self._repeat_at: int | None = None
         self._tool_waits = False
         self._traffic_at = -SECOND
+        self._held = -SECOND
+
+    def hold(self, until: int) -> None:
+        """Let nothing go before this instant (ns)."""
+        self._held = until
 
     def set_pace(self, rate: float, burst: int, quiet: int) -> None:
         """Change the rate, the burst and the quiet time (ns)."""
-        self._bucket = TokenBucket(rate, max(burst, _ITEM_MESSAGES))
+        self._bucket = self._bucket.changed(rate, max(burst, _ITEM_MESSAGES))
         self._quiet = quiet
 
     def add(self, item: Item) -> None:
@@ -161,7 +173,8 @@ class Schedule:
     def due(self) -> int:
         """Return when to call `pop` (ns)."""
         # The cost of an item is known only when its messages are made: there must be room for the most possible.
-        return max(0 if self._fresh or self._relayed else self._turn_at(), self._bucket.ready_at(_ITEM_MESSAGES))
+        turn = 0 if self._fresh or self._relayed else self._turn_at()
+        return max(turn, self._held, self._bucket.ready_at(_ITEM_MESSAGES))
 
     def pop(self, now: int) -> Item | None:
         """Return the item to announce now, if any; `sent` takes its cost."""

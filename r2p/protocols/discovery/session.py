@@ -473,6 +473,10 @@ class Discovery(DiscoveryProtocol):
         """
         self._schedule.set_pace(rate, burst, round(quiet * SECOND))
 
+    def hold(self, until: int) -> None:
+        """Announce nothing before `until` (monotonic ns), as what was announced is not on the link yet."""
+        self._schedule.hold(until)
+
     def link_up(self, now: int) -> list[Event]:
         """Introduce this module to the other end, query it, and announce everything."""
         self._outbox.up = True

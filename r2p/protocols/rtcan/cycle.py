@@ -27,6 +27,7 @@ NO_SLOT = 1 << 16
 _CATCH_UP = 64  # part of a slot by which a cycle is shortened while network time catches up
 _IN_TIME = 8_000  # ns between plan and stamp of a sync: two calibrated latencies that vary by +-3 us, and a bit more
 _AMBIGUOUS = 128  # cycles: half of what the 8 bits of a sync tell apart
+_MEAN = 16  # cycles over which free slots are counted, roughly
 _DELAYED = 16  # cycles that a sync may be ahead of NETWORK, which waits for a free slot
 _MICROSECOND = 1000
 
@@ -103,6 +104,12 @@ class Cycle:
         self._first_at = 0
         self._length = 0
         self._widest = 0  # how far a sync was from where it was expected by the one before it (ns)
+        self._mean_free: float = timing.slots - 1
+
+    @property
+    def free_rate(self) -> float:
+        """Free slots a second, in the mean of the last cycles; all of them are while there is no cycle."""
+        return self._mean_free * SECOND / self.timing.cycle
 
     @property
     def running(self) -> bool:
@@ -272,6 +279,8 @@ class Cycle:
         if mask != self.mask:
             self.mask = mask
             self.free, self.next_free = _free(mask, self.timing.slots)
+        if mask is not None:
+            self._mean_free += (len(self.free) - self._mean_free) / _MEAN
 
     def _distance(self, start: int) -> tuple[int, int]:
         """Return how many cycles after this one a start of frame lies, and how far off (ns)."""

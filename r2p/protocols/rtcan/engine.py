@@ -110,6 +110,11 @@ class Engine:
         """The number of waiting messages, and of management messages that wait for silence."""
         return self.transmitter.queue.size + len(self._limiter.waiting)
 
+    @property
+    def management_waiting(self) -> int:
+        """The number of waiting management messages."""
+        return self.transmitter.queue.count(rtcan.message_id(rtcan.MANAGEMENT, self.id8 or 0))
+
     def network_time(self, now: int) -> int | None:
         """Return the time that all nodes of the network share (ns); None while unknown."""
         return self.cycle.network_time(now)

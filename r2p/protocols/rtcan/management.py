@@ -111,9 +111,11 @@ class ManagementSender:
             self._enqueue(now, self._message_id(), data, None, CONTROL_DEADLINE)
 
     def send_bytes(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> None:
-        """Send a message; before the others, if it is urgent."""
+        """Send a message; before the others, if it is urgent. One that waits already is not sent twice."""
         if self._detector.profile is not Profile.FIRMWARE:
-            self._enqueue(now, self._message_id(), data, handle, _URGENT if urgent else DEADLINE)
+            message = self._message_id()
+            if urgent or handle is not None or not self._transmitter.queue.repeats(message, data):
+                self._enqueue(now, message, data, handle, _URGENT if urgent else DEADLINE)
             return
         dropped = self.limiter.put(data, urgent=urgent, handle=handle)
         self._context.report(dropped, Fate.FULL, missed=False, at=now)
@@ -128,7 +130,10 @@ class ManagementSender:
         return rtcan.message_id(rtcan.MANAGEMENT, self._node_id.id8)
 
     def _enqueue(self, now: int, message: int, data: bytes, handle: Hashable, within: int) -> None:
-        outgoing = QueuedMessage(message, data, now + within, drop=False, handle=handle)
+        eased = (
+            within == DEADLINE and message != rtcan.FIRMWARE_MANAGEMENT
+        )  # firmware's has no leases of slots to stop
+        outgoing = QueuedMessage(message, data, now + within, drop=False, handle=handle, eased=eased)
         if self._transmitter.queue.put(outgoing, urgent=within < DEADLINE, management=True):
             self._transmitter.reschedule(now)
         else:

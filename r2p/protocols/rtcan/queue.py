@@ -5,6 +5,9 @@ a topic ever interleave. A FIFO is as urgent as the most urgent message in it. T
 that have the same laxity at this moment (whole ms) are next to each other, and the oldest of them goes first.
 
 Laxity is computed anew at every try: `next_frame` changes no order, only `frame_sent` does.
+
+Discovery is `eased`: while it is overdue it stays at `EASED`, behind everything else that is. Else twenty modules that
+have too much to say would fill all free slots, and those with low ids would keep the leases of the others out.
 """
 
 from bisect import bisect_left, insort
@@ -15,7 +18,13 @@ import msgspec
 
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import FRAME_MAX, LAXITY_SHIFT, MESSAGE_SHIFT, NRT, SRT_MAX, Frame
-from r2p.units import LONG_AGO, MILLISECOND, NEVER
+from r2p.units import LONG_AGO, MILLISECOND, NEVER, SECOND
+
+EASED = rtcan.SRT_MIN + 1
+"""The least laxity of discovery, until it is `_STARVED`."""
+_STARVED = (
+    2 * SECOND
+)  # ns overdue, less than a lease; then events that are overdue and not dropped have had the bus for long enough
 
 _FIRST = 1 << 62  # more than any count of messages: taken off the order of management, which goes before the others
 
@@ -24,7 +33,8 @@ class QueuedMessage(msgspec.Struct, eq=False):
     """A waiting message. `deadline` NEVER: non real-time. `drop`: given up when overdue, unless it has started.
 
     Once its first frame is sent it is always finished: firmware of 2014 loses the next message as well when the end of
-    one is missing. `recalled`: its frame was withdrawn, as the node uses the bus in another way from now on.
+    one is missing. `recalled`: its frame was withdrawn, as the node uses the bus in another way from now on. `eased`:
+    it is discovery.
     """
 
     message: int
@@ -38,6 +48,7 @@ class QueuedMessage(msgspec.Struct, eq=False):
     errors: int = 0
     unknown: bool = False
     recalled: bool = False
+    eased: bool = False
 
     @property
     def expiry(self) -> int:
@@ -47,7 +58,7 @@ class QueuedMessage(msgspec.Struct, eq=False):
 
 class _MessageFifo(msgspec.Struct, eq=False):
     """The messages of one topic. `busy`: the port has a frame of the first one; `held`: no try before this instant.
-    `deadline`, `order` and `expiry` are the earliest of its messages.
+    `deadline`, `order` and `expiry` are the earliest of its messages. `eased`: all of them are.
     """
 
     waiting: deque[QueuedMessage]
@@ -56,6 +67,14 @@ class _MessageFifo(msgspec.Struct, eq=False):
     expiry: int = NEVER
     busy: bool = False
     held: int = LONG_AGO
+    eased: bool = False
+
+    def laxity(self, now: int) -> int:
+        """Return the laxity of its next frame."""
+        if self.deadline == NEVER:
+            return NRT
+        left = self.deadline - now
+        return rtcan.srt_laxity(left if not self.eased or left < -_STARVED else max(left, EASED * MILLISECOND))
 
 
 class LaxityQueue:
@@ -68,6 +87,7 @@ class LaxityQueue:
         self._depth = depth
         self._fifos: dict[int, _MessageFifo] = {}  # by message id
         self._sorted: list[tuple[int, int, _MessageFifo]] = []  # by deadline and order
+        self._eased: _MessageFifo | None = None  # the FIFO of this node's management, while it has only discovery
         self.size = 0
         """The number of waiting messages."""
         self._count = 0
@@ -124,12 +144,24 @@ class LaxityQueue:
         if self.only is not None:
             fifo = self._fifos.get(self.only)
             return fifo.waiting[0] if fifo is not None and not fifo.busy and fifo.held <= now else None
+        best, eased = self._best(now, nrt=nrt), self._eased
+        if (
+            eased is None
+            or eased.busy
+            or eased.held > now
+            or (best is not None and best.laxity(now) < eased.laxity(now))
+        ):
+            return None if best is None else best.waiting[0]
+        return eased.waiting[0]
+
+    def _best(self, now: int, *, nrt: bool) -> _MessageFifo | None:
+        """Return the FIFO to try now, without the eased one."""
         # The first FIFO may not be the best: among those of the same laxity the oldest goes first.
         chosen: tuple[int, int, _MessageFifo] | None = None
         limit: int | None = None
         for entry in self._sorted:
             fifo = entry[2]
-            if fifo.busy or fifo.held > now:
+            if fifo.busy or fifo.eased or fifo.held > now:
                 continue
             if chosen is None:
                 chosen = entry
@@ -142,7 +174,7 @@ class LaxityQueue:
                 chosen = entry
         if chosen is None or (chosen[0] == NEVER and not nrt):
             return None
-        return chosen[2].waiting[0]
+        return chosen[2]
 
     def best_nrt(self, now: int) -> QueuedMessage | None:
         """Return the non real-time message to try now."""
@@ -157,7 +189,7 @@ class LaxityQueue:
         """Return a message's next frame, with its present laxity. The topic competes again once it is sent or back."""
         fifo = self._fifos[message.message]
         fifo.busy = True
-        laxity = NRT if fifo.deadline == NEVER else rtcan.srt_laxity(fifo.deadline - now)
+        laxity = fifo.laxity(now)
         at = message.sent * FRAME_MAX
         # `encode_identifier` inlined: it would repeat the checks of the message for each frame.
         identifier = laxity << LAXITY_SHIFT | message.message << MESSAGE_SHIFT | message.frames - 1 - message.sent
@@ -202,9 +234,19 @@ class LaxityQueue:
             self._drop(fifo, gone)
         return gone
 
+    def count(self, message: int) -> int:
+        """Return the number of waiting messages of this topic."""
+        fifo = self._fifos.get(message)
+        return 0 if fifo is None else len(fifo.waiting)
+
     def holds(self, message: int) -> bool:
         """Return whether messages of this topic are waiting."""
         return message in self._fifos
+
+    def repeats(self, message: int, payload: bytes) -> bool:
+        """Return whether a message of these bytes waits already, and has not started."""
+        fifo = self._fifos.get(message)
+        return fifo is not None and any(each.payload == payload and not each.sent for each in fifo.waiting)
 
     def messages(self) -> Iterator[QueuedMessage]:
         """Yield all messages, topic by topic."""
@@ -216,6 +258,7 @@ class LaxityQueue:
         gone = list(self.messages())
         self._fifos.clear()
         self._sorted.clear()
+        self._eased = None
         self.size = 0
         self._expiry = NEVER
         return gone
@@ -232,6 +275,8 @@ class LaxityQueue:
 
     def _leave(self, fifo: _MessageFifo) -> None:
         del self._sorted[bisect_left(self._sorted, (fifo.deadline, fifo.order))]
+        if fifo is self._eased:
+            self._eased = None
 
     def _append(self, fifo: _MessageFifo, message: QueuedMessage) -> None:
         """Append a message, which may make the FIFO more urgent."""
@@ -240,6 +285,8 @@ class LaxityQueue:
             self._leave(fifo)
             fifo.deadline = message.deadline
             insort(self._sorted, (fifo.deadline, fifo.order, fifo))
+        fifo.eased = fifo.eased and message.eased
+        self._eased = fifo if fifo.eased else self._eased if self._eased is not fifo else None
         if message.expiry < fifo.expiry:
             fifo.expiry = message.expiry
             self._expiry = min(self._expiry, fifo.expiry)
@@ -263,6 +310,9 @@ class LaxityQueue:
         if fifo.expiry < self._expiry:
             self._expiry = fifo.expiry
         insort(self._sorted, (fifo.deadline, fifo.order, fifo))
+        fifo.eased = first.eased and all(each.eased for each in waiting)
+        if fifo.eased:
+            self._eased = fifo
 
 
 def _same_laxity_until(deadline: int, now: int) -> int:

@@ -65,6 +65,12 @@ _LOSSES = ("undecodable", "management dropped")  # what the engine counts as los
 _RATE = 100.0  # messages a second: a fifteenth of a bus of 1 Mbit/s, and the same share of slower ones
 _BURST, _BURST_MIN = 8, 4  # messages at once, on a bus of 1 Mbit/s and on the slowest ones
 _BIT = 1000  # ns at 1 Mbit/s
+_RATE_MIN = 1.0  # leases are longer then, as long as three rounds
+_FREE_SHARE = 0.5  # of the free slots, for the discovery of all modules together
+_FRAMES = 4  # of a message of discovery
+_WAITING_MAX = 16  # messages of this node, on a full bus: more of discovery would only be older when they are sent
+_HOLD = 50 * MILLISECOND
+_RATE_STEP = 1.2  # by which the rate must differ before it is set anew
 _FIRMWARE_RATE, _FIRMWARE_QUIET = 12.0, 0.033  # a second, and s: all modules have one id, so none may send at once
 
 _OFFSET_VALID = 10 * MILLISECOND  # for which UTC's offset is not read again: slewed by 500 ppm it moves 5 us meanwhile
@@ -110,7 +116,7 @@ class RtcanLink(BufferedLink):
             aliases=hub.space.aliases,
         )
         super().__init__(name, hub, discovery=discovery)
-        self._set_pace = discovery.set_pace  # which other kinds of discovery lack
+        self._set_pace, self._hold = discovery.set_pace, discovery.hold  # which other kinds of discovery lack
         self.engine = Engine(settings)
         self.stats.faults = self.engine.counts  # one counter for what goes wrong in the engine and on the bus
         self.driver = EngineDriver(self.engine, port, self)
@@ -127,6 +133,8 @@ class RtcanLink(BufferedLink):
         self._slotted = SlottedTopics(self, self.driver, self._has_subscribers)
         self._transmitter = Transmitter(self, self.driver, self._slotted)
         self._on_bus = False
+        self._rate = self._rate_max = _RATE  # of discovery now, and at most
+        self._burst = _BURST
 
     # Called by the driver
 
@@ -199,9 +207,23 @@ class RtcanLink(BufferedLink):
         rate, burst, quiet = _RATE * _BIT / bit, max(_BURST_MIN, _BURST * _BIT // bit), 0.0
         if profile is Profile.FIRMWARE:
             rate, burst, quiet = _FIRMWARE_RATE, _BURST_MIN, _FIRMWARE_QUIET
+        self._rate_max, self._burst, self._rate = rate, burst, rate
         self._set_pace(rate, burst, quiet)
         self.calls.rate = rate / 2 if profile is Profile.FIRMWARE else rate  # half of the bus stays for discovery
         self._topic_ids.set_rate(rate)
+
+    def _adapt_discovery(self) -> None:
+        """Limit discovery to this module's part of the slots that are free now: they carry soft real-time, too."""
+        if self.engine.profile is Profile.FIRMWARE or not self.engine.ready:
+            return
+        modules = 1 + sum(not info.hops for info in self.discovery.modules.values())
+        part = _FREE_SHARE * self.engine.cycle.free_rate / _FRAMES / modules
+        rate = min(self._rate_max, max(_RATE_MIN, part))
+        if not self._rate / _RATE_STEP < rate < self._rate * _RATE_STEP:
+            self._rate = rate
+            self._set_pace(rate, self._burst, 0.0)
+        if self.engine.management_waiting > _WAITING_MAX:
+            self._hold(self._clock.monotonic() + _HOLD)
 
     def _announce(self) -> None:
         """Announce everything, under what may be another id8 than before."""
@@ -424,6 +446,7 @@ class RtcanLink(BufferedLink):
 
     def _poll(self) -> None:
         self._set_utc()
+        self._adapt_discovery()
         now = self._clock.monotonic()
         self._renumber(self._topic_ids.retry(now))
         if self._message_ids.end_lingering(now):

@@ -30,6 +30,15 @@ def test_a_bucket_never_lets_more_pass(rate: float, burst: int, requests: list[t
             assert last - first + 1 <= burst + (passed[last] - start) / bucket.gap
 
 
+def test_a_bucket_of_another_rate_owes_what_it_did() -> None:
+    bucket = TokenBucket(10, 4)
+    bucket.spend(0, 4)
+    slower = bucket.changed(5, 4)
+    assert bucket.ready_at(1) == 100 * MS
+    assert slower.ready_at(4) == 400 * MS
+    assert slower.ready_at(1) <= 0 < slower.changed(20, 2).ready_at(1)
+
+
 class TestSchedule:
     def test_a_ring_of_what_is_left(self) -> None:
         schedule = Schedule(1000, 100, 0)
@@ -48,6 +57,14 @@ class TestSchedule:
         names = [key[0] for key in said if key]
         assert names[:6] == ["t0", "t2", "t3"] * 2
         assert set(names[-6:]) == {"t2", "t3"}
+
+    def test_nothing_goes_while_it_is_held(self) -> None:
+        schedule = Schedule(1000, 100, 0)
+        schedule.start(0)
+        schedule.hold(70 * MS)
+        assert schedule.due() == 70 * MS
+        assert schedule.pop(70 * MS - 1) is None
+        assert schedule.pop(70 * MS) is not None
 
     def test_a_thousand_new_items_keep_no_presence_back_for_longer_than_a_lease(self) -> None:
         schedule = Schedule(100, 10, 0)

@@ -190,3 +190,13 @@ def test_free_slots_are_those_of_the_mask() -> None:
     cycle.stop()
     assert not cycle.free
     assert set(cycle.next_free) == {NO_SLOT}
+
+
+def test_free_slots_are_counted_over_the_last_cycles() -> None:
+    cycle = slave()
+    free = TIMING.slots - 1
+    assert cycle.free_rate == pytest.approx(free * 1e9 / TIMING.cycle)
+    cycle.lead(0, 1, 1)
+    for _ in range(200):
+        cycle.advance(0b1111)
+    assert cycle.free_rate == pytest.approx((free - 3) * 1e9 / TIMING.cycle, rel=1e-3)

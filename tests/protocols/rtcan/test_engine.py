@@ -19,6 +19,7 @@ from tests.protocols.rtcan.networks import (
     firmware_management,
     network,
     publish,
+    ready_engine,
     syncs,
 )
 
@@ -209,3 +210,13 @@ def test_a_node_that_slept_finds_its_place_again() -> None:
         assert sorted(each.engine.election.role.value for each in nodes) == ["master", "slave", "slave"]
         assert len({current_cycle(each.engine) for each in nodes}) == 1
         assert len({each.engine.network.master for each in nodes}) == 1
+
+
+def test_discovery_that_waits_already_is_not_sent_twice() -> None:
+    engine, now = ready_engine()
+    alive, other = (management.encode(management.Alive(name)) for name in ("A", "B"))
+    for data in (alive, other, alive, other, alive):
+        engine.manage(now, data)
+    assert engine.management_waiting == 2
+    engine.manage(now, alive, handle="its fate matters")
+    assert engine.management_waiting == 3

@@ -443,3 +443,25 @@ def test_what_waits_for_a_slot_that_is_lost_is_given_up() -> None:
     owner.requests.suspend(SECOND, owner.periodic, "another master")
     assert owner.abandoned == [SECOND]
     assert owner.periodic.payload is None
+
+
+def test_leases_outlast_discovery_that_fills_all_free_slots() -> None:
+    """The nodes with low ids win each arbitration of equal laxity, and say more than the bus can carry."""
+    bus = Bus()
+    *talkers, owner, master = network(bus, 0, 0, 0, 0, 1)
+    counted(owner)
+    for high in range(20, 20 + 53):  # of 59 slots, one in each cycle; 6 are free
+        master.act(master.engine.reserve(master.now, high, 8, CYCLE))
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, CYCLE))
+    bus.run(SECOND)
+    assert len(owner.of(SlotsGranted)) == 1
+    since = bus.now
+    alive = management.encode(management.Alive("TALKER"))
+    while bus.now < since + 2 * LEASE:
+        for node in talkers:
+            if node.engine.waiting < 20:
+                node.act(node.engine.manage(node.now, alive))
+        bus.run(CYCLE)
+    assert not owner.of(SlotsLost)
+    said = [node for at, frame, node in bus.sent if at > since and not is_sync(frame) and node in talkers]
+    assert len(said) > 1000, "discovery fills what is left"

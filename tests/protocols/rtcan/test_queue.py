@@ -348,3 +348,35 @@ def test_recorded_queue(case: CanCase) -> None:
         else:  # the original's is that of HRT (64 and 0 ms left) or of NRT (overdue, and 63 ms or more)
             assert recorded in (rtcan.HRT, rtcan.NRT)
             assert frame.id >> 23 == min(max(remaining, 1), 62)
+
+
+def discovery(remaining: float, size: int = 1) -> QueuedMessage:
+    return QueuedMessage(1, bytes(size), NOW + int(remaining * MS), drop=False, eased=True)
+
+
+def test_overdue_discovery_is_behind_what_is_nearly_overdue() -> None:
+    queue = filled(srt(2, 1.9), srt(3, 2.5), srt(4, 3.5))
+    assert queue.put(discovery(-3), management=True)
+    assert drain(queue) == [(2, 1, 0), (1, 2, 0), (3, 2, 0), (4, 3, 0)]
+
+
+def test_urgent_management_takes_discovery_before_it_along() -> None:
+    queue = filled()
+    assert queue.put(discovery(-3, size=16), management=True)
+    started = queue.best(NOW)
+    assert started is not None
+    assert rtcan.laxity_of(queue.next_frame(started, NOW).id) == 2
+    queue.frame_sent(started)
+    assert queue.put(QueuedMessage(1, bytes(1), NOW, drop=False), urgent=True, management=True)
+    assert drain(queue) == [(1, 1, 0), (1, 1, 0)]
+    assert queue.put(discovery(-3), management=True)
+    assert drain(queue) == [(1, 2, 0)]
+
+
+def test_starved_discovery_gets_the_bus_from_events_that_are_not_dropped() -> None:
+    queue = filled(srt(2, -2900, drop=False))
+    assert queue.put(discovery(-1999), management=True)
+    assert [message for message, _, _ in drain(queue)] == [2, 1]
+    queue = filled(srt(2, -2900, drop=False))
+    assert queue.put(discovery(-2001), management=True)
+    assert drain(queue) == [(1, 1, 0), (2, 1, 0)]

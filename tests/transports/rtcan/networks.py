@@ -78,9 +78,12 @@ class Lab:
 
 
 @asynccontextmanager
-async def lab(*names: str, profile: Profile = Profile.AUTO) -> AsyncIterator[tuple[Lab, list[r2p.Node]]]:
+async def lab(
+    *names: str, profile: Profile = Profile.AUTO, **options: object
+) -> AsyncIterator[tuple[Lab, list[r2p.Node]]]:
     """A bus with these modules, and a node in each."""
+    options["profile"] = profile
     made = Lab()
     async with AsyncExitStack() as stack:
-        nodes = [await stack.enter_async_context(made.module(name, options={"profile": profile})) for name in names]
+        nodes = [await stack.enter_async_context(made.module(name, options=options)) for name in names]
         yield made, nodes

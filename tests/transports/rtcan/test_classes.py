@@ -10,7 +10,7 @@ import r2p
 from r2p.clock import clock_of
 from r2p.codecs import rtcan
 from r2p.msg import PWM2, Float32, Led
-from tests.transports.rtcan.networks import CYCLE, SLOT, Lab, lab
+from tests.transports.rtcan.networks import CYCLE, SLOT, Lab, lab, until
 
 pytestmark = pytest.mark.virtual_time
 
@@ -311,3 +311,17 @@ async def test_network_time_is_the_same_everywhere() -> None:
         utc = made.link("B").utc()
         assert utc is not None
         assert abs(utc[0] - bob.now()) < 100_000 * 5.0 + 2_000_000
+
+
+async def test_discovery_leaves_room_in_the_slots_that_are_free() -> None:
+    async with lab("A", "B", slots=10) as (made, (alice, bob)):
+        for number in range(4):
+            alice.advertise(f"pwm{number}", PWM2, r2p.Periodic(0.00996, PWM2))
+            bob.subscribe(f"pwm{number}", PWM2)
+        await until(lambda: [topic.period for topic in made.link("A").slots.values()] == [5] * 4)
+        await asyncio.sleep(8.0)  # what was allowed before has been said: of 10 slots one is left
+        made.clear()
+        await asyncio.sleep(4.0)
+        said = made.sent(lambda found: rtcan.high_byte(found.message_id) == rtcan.MANAGEMENT)
+        assert all(topic.period for topic in made.link("A").slots.values())
+        assert 50 < len(said) < 350  # of 400, with claims, renewals, and answers
