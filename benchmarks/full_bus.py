@@ -1,6 +1,6 @@
-"""Admission to a nearly full bus: 20 modules that reserve 50 to 95 % of the slots (thesis 3.3.1 and 4.3.4).
+"""A nearly full bus: 20 modules that reserve 50 to 95 % of the slots (thesis 3.3.1 and 4.3.4).
 
-`python -m benchmarks.admission` runs, under virtual time, modules whose periodic topics need one slot in each cycle,
+`python -m benchmarks.full_bus` runs, under virtual time, modules whose periodic topics need one slot in each cycle,
 and each of which the next module subscribes to. It prints when all slots were granted, which were lost later, and the
 share of management, the same each time.
 """
@@ -34,7 +34,7 @@ class Eight(r2p.Message):
     value: r2p.f64 = 0.0
 
 
-class Admission(msgspec.Struct, frozen=True):
+class FullBus(msgspec.Struct, frozen=True):
     """What happened at one load. `granted` and `known` are in s after power, None: not within a minute."""
 
     granted: float | None
@@ -48,7 +48,7 @@ class Admission(msgspec.Struct, frozen=True):
     """Share of the bus in that time."""
 
 
-async def measure(percent: int, seconds: float, seed: int, modules: int = MODULES) -> Admission:
+async def measure(percent: int, seconds: float, seed: int, modules: int = MODULES) -> FullBus:
     """Let modules reserve so much of all slots, and watch the bus for a while."""
     can = sim.can_bus("full", seed=seed)
     traffic = Traffic(can)
@@ -68,7 +68,7 @@ async def measure(percent: int, seconds: float, seed: int, modules: int = MODULE
         lost = await _count_lost(everything, seconds)
         management = traffic.bits["management"] / seconds / can.bitrate
         missed = sum(each.missed for each in everything) - missed
-        return Admission(granted, known and known + (granted or 0.0), lost, missed, count, management)
+        return FullBus(granted, known and known + (granted or 0.0), lost, missed, count, management)
 
 
 async def _node(node: r2p.Node, topics: Sequence[str], number: int, modules: int) -> None:
@@ -106,7 +106,7 @@ async def _until(done: object) -> float | None:
 
 def main() -> None:
     """Print a table in Markdown."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.admission", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.full_bus", description=__doc__)
     parser.add_argument("--percent", type=int, action="append", help="of all slots; may be repeated")
     parser.add_argument("--seconds", type=float, default=60.0, help="to watch, of virtual time")
     parser.add_argument("--seed", type=int, default=1)
