@@ -130,9 +130,8 @@ class ManagementSender:
         return rtcan.message_id(rtcan.MANAGEMENT, self._node_id.id8)
 
     def _enqueue(self, now: int, message: int, data: bytes, handle: Hashable, within: int) -> None:
-        eased = (
-            within == DEADLINE and message != rtcan.FIRMWARE_MANAGEMENT
-        )  # firmware's has no leases of slots to stop
+        # Among firmware there are no leases of slots that discovery could stop.
+        eased = within == DEADLINE and message != rtcan.FIRMWARE_MANAGEMENT
         outgoing = QueuedMessage(message, data, now + within, drop=False, handle=handle, eased=eased)
         if self._transmitter.queue.put(outgoing, urgent=within < DEADLINE, management=True):
             self._transmitter.reschedule(now)
