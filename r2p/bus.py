@@ -20,7 +20,7 @@ from r2p.clock import SHORTEST, check_seconds, clock_of
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import Closed, Error
 from r2p.protocols.can_orders import Mailbox, Outcome
-from r2p.protocols.rtcan.calendar import Calendar, PeriodRule, Refusal, Reservation, occupied
+from r2p.protocols.rtcan.calendar import Calendar, PeriodRule, Refusal, Reservation, asked_exactly, occupied
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.monitor import BusLoad, BusSlot, FrameKind, Monitor, SeenFrame
 from r2p.transports.stats import LoggedCounter
@@ -41,6 +41,7 @@ __all__ = [
     "Reservation",
     "SeenFrame",
     "Timing",
+    "asked_exactly",
     "occupied",
     "timing",
 ]

@@ -16,9 +16,18 @@ import msgspec
 import typer
 
 import r2p
-from r2p.bus import BusMonitor, BusSlot, Calendar, PeriodRule, Refusal, Reservation, Timing, timing
+from r2p.bus import (
+    BusMonitor,
+    BusSlot,
+    Calendar,
+    PeriodRule,
+    Refusal,
+    Reservation,
+    Timing,
+    asked_exactly,
+    timing,
+)
 from r2p.codecs import rtcan
-from r2p.protocols.rtcan.calendar import asked_exactly
 from r2p.tools.options import Format, hertz, seconds, time_option
 from r2p.tools.output import Output, Record
 from r2p.tools.session import TimedOut, execute
