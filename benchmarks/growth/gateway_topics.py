@@ -9,6 +9,7 @@ import socket
 import struct
 import time
 from multiprocessing.connection import Connection
+from typing import cast
 
 import r2p
 from benchmarks.growth.curve import Curve
@@ -52,8 +53,7 @@ class _Firmware(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
+        self._transport = cast("asyncio.Transport", transport)
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def data_received(self, data: bytes) -> None:

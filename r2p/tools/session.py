@@ -277,8 +277,9 @@ class Session:
         start = changed_at = loop.time()
         known = 0
         while (now := loop.time()) - start < _SETTLE_MAX:
-            complete = now - start > _FIRMWARE or not (self._expects_more() or self._lacks_nodes())
-            if now - changed_at > quiet and complete:
+            if now - changed_at > quiet and (  # the second part takes long on a large network
+                now - start > _FIRMWARE or not (self._expects_more() or self._lacks_nodes())
+            ):
                 return True
             await asyncio.sleep(_SETTLE_POLL)
             if (count := self._known()) != known:
@@ -286,9 +287,8 @@ class Session:
         return False
 
     def _known(self) -> int:
-        topics = self.module.network.topics().values()
-        endpoints = sum(len(view.publishers) + len(view.subscribers) for view in topics)
-        return len(topics) + endpoints + len(self.module.network.modules())
+        known = [link.discovery for link in self.module.links]
+        return sum(len(each.topics) + len(each.endpoints) + len(each.modules) for each in known)
 
     def _expects_more(self) -> bool:
         """Return whether a link lacks r2p modules, which would answer at once, or has modules without topics.
