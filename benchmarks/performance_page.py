@@ -55,7 +55,7 @@ def fill(page: str, name: str, text: str) -> str:
     return f"{head}{begin}\n{text}\n\n{end}{tail}"
 
 
-def curves(rows: Rows) -> Iterator[tuple[str, Plot]]:
+def curves(rows: Rows) -> Iterator[tuple[str, str, Plot]]:
     """The streams and the round trips by size, on logarithmic scales: r2p beside zenoh-python."""
     points = [(math.log10(int(found[1])), row) for row in rows if (found := _SIZE.match(row["what"]))]
     for index, (name, title) in enumerate((("stream", "Messages a second"), ("trip", "There and back, p50 (us)"))):
@@ -63,7 +63,8 @@ def curves(rows: Rows) -> Iterator[tuple[str, Plot]]:
             peer: [(size, value) for size, row in points if (value := _value(row[field], index)) is not None]
             for peer, field in (("r2p over zenoh", "measured"), ("zenoh-python", "baseline"))
         }
-        yield name, _plot(title, lines)
+        if any(lines.values()):
+            yield name, f"{title}, by bytes of the payload", _plot(title, lines)
 
 
 def _value(text: str, index: int) -> float | None:
@@ -94,11 +95,14 @@ def main(commit: str) -> None:
     ASSETS.mkdir(exist_ok=True)
     page, state = PAGE.read_text(), runs[-1]["machine"]
     measured = f"Measured at {commit}: {state['processor']}, Python {state['python']}, load {state['load']}."
+    drawn = list(curves(rows_of(runs, SECTIONS["others"])))
+    pictures = "\n".join(f"![{title}](assets/performance/{name}.svg)" for name, title, _ in drawn)
     for name, pattern in SECTIONS.items():
         if rows := rows_of(runs, pattern):
-            page = fill(page, name, f"{measured}\n\n{table(rows)}")
+            text = f"{measured}\n\n{table(rows)}"
+            page = fill(page, name, f"{text}\n\n{pictures}" if drawn and name == "others" else text)
             (ASSETS / f"{name}.json").write_text(json.dumps({"machine": state, "rows": rows}, indent=1) + "\n")
-    for name, plot in curves(rows_of(runs, SECTIONS["others"])):
+    for name, _, plot in drawn:
         plot.write(ASSETS / f"{name}.svg")
     PAGE.write_text(page)
 
