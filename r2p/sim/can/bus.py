@@ -102,6 +102,8 @@ class CanBus(BusWire):
         self.timeline = timeline or Timeline(loop)
         self.bit = bit
         self.noise = noise
+        self.bit_error_rate = 0.0
+        """The share of bits that are inverted; a longer frame is more often hit. It adds to `noise`."""
         self.statistics = Statistics(bit, self.timeline.now())
         self.observers: list[Callable[[FrameRecord], object]] = []
         self.loss_observers: list[Callable[[ArbitrationLoss], object]] = []
@@ -339,7 +341,7 @@ class CanBus(BusWire):
         end = start + transfer.bits * self.bit
         for request in requests:
             request.busy_until = end
-        if (self.noise or self._noisy or self._disturbances) and self._hit(transfer):
+        if (self.noise or self.bit_error_rate or self._noisy or self._disturbances) and self._hit(transfer):
             return
         if transfer.receivers:
             self.timeline.at(end, self._finish, transfer, end)
@@ -393,7 +395,7 @@ class CanBus(BusWire):
     def _hit(self, transfer: _Transfer) -> bool:
         """Decide whether noise hits this frame. True: the frame is destroyed."""
         disturbed, bit = self._disturbed(transfer)
-        if disturbed or self._numbers.random() < self.noise:
+        if disturbed or self._numbers.random() < self._risk(transfer.bits):
             bit = bit or self._numbers.randrange(1, transfer.bits + 1)
             bus = flip(wire_bits(transfer.frame), min(bit, transfer.bits))
             self._destroy(transfer, bus, ErrorKind.BIT, transfer.owners)
@@ -410,6 +412,11 @@ class CanBus(BusWire):
                 at = transfer.start + (transfer.bits - _BITS_AFTER_ACK_DELIMITER) * self.bit
                 self.timeline.at(at, self._crc_failed, transfer, node, at)
         return False
+
+    def _risk(self, bits: int) -> float:
+        """Return the chance that a frame of so many bits is hit."""
+        rate = self.bit_error_rate
+        return 1.0 - (1.0 - self.noise) * (1.0 - rate) ** bits if rate else self.noise
 
     def _crc_failed(self, transfer: _Transfer, node: CanController, at: int) -> None:
         """Let a receiver see alone that the frame was wrong, without an effect on the others."""
