@@ -4,9 +4,10 @@ As CANopenNode implements it: SYNC has identifier 0x80 and a counter of one byte
 cycle (1006h). A synchronous PDO of transmission type n is sent at every n-th SYNC; one that still waits at the next
 SYNC is dropped (synchronous window, 1007h, of a whole cycle). Events are PDOs of type 255.
 
-Tuned: the cycle is the shortest period of the set; the identifiers of PDOs are not the predefined ones but in the order
-of deadlines, which CiA 301 allows; the counter's start value (SYNC start value) spreads the PDOs of long periods over
-the cycles. Simplified: NMT, heartbeats and SDOs are not sent, and there is no second producer of SYNC: CiA 301 has none.
+Tuned: the cycle is the shortest period of the set; the identifiers of PDOs are not the predefined ones but in order of
+deadlines, which CiA 301 allows; the counter's start value (SYNC start value) spreads the PDOs of long periods over
+the cycles. Simplified: no NMT, heartbeats or SDOs are sent, and no second producer of SYNC takes over: that is not part
+of CiA 301.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from benchmarks.protocols.fixed_priority import standard
-from benchmarks.protocols.message_sets import frames_ns
+from benchmarks.protocols.message_sets import frames_ns, least_busy
 from benchmarks.protocols.network import ProtocolNetwork
 from r2p.codecs.can_bits import OtherFrame, wire_identifier
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from benchmarks.protocols.outbox import MessageOutbox
     from r2p.sim.can import CanController
 
@@ -57,7 +60,7 @@ class CanOpen(ProtocolNetwork):
     def sync_identifier(self) -> int | None:
         return SYNC
 
-    def configuration(self) -> dict[str, object]:
+    def configuration(self) -> Mapping[str, object]:
         ranks = {message.name: rank for rank, message in enumerate(self.set.by_deadline())}
         return {name: (rank, self.placed().get(name)) for name, rank in ranks.items()}
 
@@ -73,7 +76,7 @@ class CanOpen(ProtocolNetwork):
             if message.sporadic:
                 continue
             kind = max(1, min(_TYPE_MAX, message.period // self.shortest()))
-            start = min(range(kind), key=lambda each: max(busy[each::kind]))
+            start = least_busy(busy, kind)
             for each in range(start, _TYPE_MAX, kind):
                 busy[each] += frames_ns(message.size, self.set.bitrate)
             places[message.name] = kind, start
@@ -87,12 +90,12 @@ class CanOpen(ProtocolNetwork):
             if frame.id != SYNC:
                 return
             now = self.bus.timeline.now()
-            counted[0] = frame.data[0] if counted[0] is None else counted[0] + 1  # start values count once, then SYNCs
+            counted[0] = frame.data[0] if counted[0] < 0 else counted[0] + 1  # start values count once, then SYNCs
             for box, kind, start in objects:
                 if counted[0] % kind == start:
                     box.put(box.track.release(now))
 
-        counted: list[int | None] = [None]
+        counted = [-1]
         controller.on_other = heard
         controller.filters = [(wire_identifier(OtherFrame(SYNC)), 0x7FFF_FFFF)]
 

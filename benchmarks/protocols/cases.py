@@ -11,7 +11,7 @@ from benchmarks.protocols.canopen import CanOpen
 from benchmarks.protocols.edf_identifier import EdfIdentifier
 from benchmarks.protocols.fixed_priority import Cyphal, DeadlineMonotonic, DroneCan, RateMonotonic
 from benchmarks.protocols.ftt_can import FttCan
-from benchmarks.protocols.message_sets import named_set
+from benchmarks.protocols.message_sets import SetMessage, named_set
 from benchmarks.protocols.network import ProtocolNetwork, ProtocolSetup
 from benchmarks.protocols.rtcan_network import RtcanNetwork
 from benchmarks.protocols.ttcan import SoftwareTtcan, Ttcan
@@ -21,6 +21,7 @@ from r2p.units import MILLISECOND, SECOND
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from benchmarks.protocols.message_sets import MessageSet
     from benchmarks.protocols.recorder import MessageVerdict
 
 PROTOCOLS: dict[str, type[ProtocolNetwork]] = {
@@ -122,9 +123,7 @@ def simulate(case: StudyCase) -> CaseFigures:
 
 async def _measure(case: StudyCase) -> CaseFigures:
     messages = named_set(case.messages, case.seed)
-    setup = ProtocolSetup(
-        messages=messages, seed=case.seed, duration=case.duration, bit_error_rate=case.bit_error_rate
-    )
+    setup = ProtocolSetup(messages=messages, seed=case.seed, duration=case.duration, bit_error_rate=case.bit_error_rate)
     network = PROTOCOLS[case.protocol](setup)
     network.start()
     await network.ready()
@@ -153,8 +152,7 @@ async def _fail(network: ProtocolNetwork, fault: str) -> int:
         await asyncio.sleep(BABBLE)
         network.babble(BABBLER, "", on=False)
     elif fault == "lost sync":
-        network.bus.disturb_next(20, identifier=network.sync_identifier())
-        await asyncio.sleep(0)
+        network.bus.disturb_next(1, identifier=network.sync_identifier())
     else:
         network.kill(network.master or "")
     await asyncio.sleep(WATCHED - (BABBLE if "babble" in fault else 0))
@@ -223,9 +221,8 @@ def add_message(protocol: str, name: str) -> AddedMessage:
 
 async def _add(protocol: type[ProtocolNetwork], name: str) -> AddedMessage:
     before = named_set(name)
-    node = before.nodes[0]
-    kind = type(before.messages[0])
-    added = kind("added", node, 4, 20 * MILLISECOND, 8 * MILLISECOND)
+    node = before.nodes[-1]
+    added = SetMessage("added", node, 4, 20 * MILLISECOND, 8 * MILLISECOND)
     after = msgspec.structs.replace(before, messages=(*before.messages, added))
     settings = []
     for messages in (before, after):
@@ -238,9 +235,8 @@ async def _add(protocol: type[ProtocolNetwork], name: str) -> AddedMessage:
     return AddedMessage(len(changed), len({owners[each] for each in changed}), *extra)
 
 
-async def _online(messages: object) -> tuple[float, int]:
-    """Let a running network of RTCAN grant slots to the last message; return ms until then, and frames of management."""
-    assert isinstance(messages, type(named_set("sae")))
+async def _online(messages: MessageSet) -> tuple[float, int]:
+    """Let a running network of RTCAN grant slots to the new message; return the ms it takes, and management frames."""
     network = RtcanNetwork(ProtocolSetup(messages=messages))
     network.start()
     network.later.add("added")

@@ -12,12 +12,16 @@ starts each epoch of 16 regions with an empty frame, as the paper needs a common
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING
 
+from benchmarks.protocols.fixed_priority import standard
 from benchmarks.protocols.network import ProtocolNetwork
 from r2p.codecs.can_bits import OtherFrame, other_frame_bits, wire_identifier
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from benchmarks.protocols.message_sets import SetMessage
     from benchmarks.protocols.outbox import MessageOutbox
     from benchmarks.protocols.recorder import MessageInstance
@@ -50,7 +54,7 @@ class EdfIdentifier(ProtocolNetwork):
             self._urgent_box(message, number)
         for place, message in enumerate(others):
             identifier = _OTHERS + place
-            self.release_freely(self.add_box(message, lambda _i, payload, i=identifier: OtherFrame(i, payload)))
+            self.release_freely(self.add_box(message, standard(identifier)))
         for name in self.set.nodes:
             self._follow(name, self.controllers[name])
         self._lead(self.controllers[self.master])
@@ -58,7 +62,7 @@ class EdfIdentifier(ProtocolNetwork):
     def sync_identifier(self) -> int | None:
         return wire_identifier(SYNC)
 
-    def configuration(self) -> dict[str, object]:
+    def configuration(self) -> Mapping[str, object]:
         urgent, others = self.split()
         fixed: dict[str, object] = {message.name: ("fixed", place) for place, message in enumerate(others)}
         return fixed | {message.name: "urgent" for message in urgent}
@@ -109,12 +113,10 @@ class EdfIdentifier(ProtocolNetwork):
     def _urgent(self, name: str) -> list[MessageOutbox]:
         return [box for box in self.boxes[name] if isinstance(self.configured[box.message.name], str)]
 
-    @property
-    def configured(self) -> dict[str, object]:
+    @cached_property
+    def configured(self) -> Mapping[str, object]:
         """The configuration, made once."""
-        if not hasattr(self, "_configured"):
-            self._configured = self.configuration()
-        return self._configured
+        return self.configuration()
 
     def _lead(self, master: CanController) -> None:
         due = master.clock.monotonic() + 1_000_000

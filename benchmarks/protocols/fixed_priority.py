@@ -22,7 +22,7 @@ from r2p.codecs.can_bits import FRAME_MAX, Frame, OtherFrame
 from r2p.units import MILLISECOND, SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from benchmarks.protocols.outbox import MessageOutbox
     from benchmarks.protocols.recorder import MessageInstance
@@ -42,7 +42,7 @@ class PlainCan(ProtocolNetwork):
             identifier = FIRST_IDENTIFIER + place
             self.release_freely(self.add_box(message, standard(identifier)))
 
-    def configuration(self) -> dict[str, object]:
+    def configuration(self) -> Mapping[str, object]:
         return {message.name: place for place, message in enumerate(self.order())}
 
     @abstractmethod
@@ -87,7 +87,7 @@ class PriorityLevels(ProtocolNetwork):
     """Its level and its subject."""
 
     def start(self) -> None:
-        levels, subjects = self.configuration(), self._subjects()
+        levels, subjects = self._levels(), self._subjects()
         names = {node: number for number, node in enumerate(self.set.nodes, start=1)}
         for message in self.set.messages:
             level, number = levels[message.name], names[message.node]
@@ -100,7 +100,10 @@ class PriorityLevels(ProtocolNetwork):
             box.service = True
             self.release_freely(box)
 
-    def configuration(self) -> dict[str, int]:
+    def configuration(self) -> Mapping[str, object]:
+        return self._levels()
+
+    def _levels(self) -> dict[str, int]:
         """Levels by deadline on a logarithmic scale, from 1 ms to 128 ms: a new message moves no other one."""
         last = len(self.levels) - 1
         places = {each.name: math.ceil(math.log2(each.deadline / MILLISECOND) * last / 7) for each in self.set.messages}

@@ -17,11 +17,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from benchmarks.protocols.fixed_priority import FIRST_IDENTIFIER, standard
-from benchmarks.protocols.message_sets import frames_ns, longest_bits
+from benchmarks.protocols.message_sets import frames_ns, least_busy, longest_bits
 from benchmarks.protocols.network import ProtocolNetwork
 from r2p.codecs.can_bits import FRAME_MAX, OtherFrame, other_frame_bits
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from benchmarks.protocols.message_sets import SetMessage
     from benchmarks.protocols.outbox import MessageOutbox
     from r2p.sim.can import CanController
@@ -64,7 +66,7 @@ class FttCan(ProtocolNetwork):
     def sync_identifier(self) -> int | None:
         return TRIGGER
 
-    def configuration(self) -> dict[str, object]:
+    def configuration(self) -> Mapping[str, object]:
         # A node knows its own identifier and flag; periods and offsets are the master's business.
         ranks = {message.name: rank for rank, message in enumerate(self.set.by_deadline())}
         return dict(ranks)
@@ -83,7 +85,7 @@ class FttCan(ProtocolNetwork):
             every = max(1, message.period // cycle) if not message.sporadic else 0
             if not every or len(places) == _FLAGS_MAX:
                 continue
-            offset = min(range(min(every, 240)), key=lambda each, every=every: max(busy[each::every]))
+            offset = least_busy(busy, every)
             length = self._length(message)
             if max(busy[offset::every]) + length > room:
                 continue
@@ -118,7 +120,7 @@ class FttCan(ProtocolNetwork):
             flags = int.from_bytes(frame.data, "little")
             window = sum(length for number, length in enumerate(self._lengths) if flags >> number & 1)
             closes = begin + self.cycle - GUARD // 2
-            opens = closes - window
+            opens = closes - window - GUARD // 2  # the first frame may be late by the jitter
             for box in boxes:
                 self._open(box, flags, (max(end + TURNAROUND, stamp), opens, closes))
 

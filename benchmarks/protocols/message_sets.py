@@ -168,6 +168,11 @@ def random_set(seed: int, load: float, bitrate: int = 1_000_000) -> MessageSet:
     return MessageSet(f"random {load:.0%}", bitrate, tuple(messages))
 
 
+def least_busy(busy: list[int], every: int) -> int:
+    """Return the offset below `every` whose cycles, one in `every`, are the least busy ones."""
+    return min(range(min(every, len(busy))), key=lambda offset: max(busy[offset::every]))
+
+
 @cache
 def named_set(name: str, seed: int = 1) -> MessageSet:
     """Return a set by its short name; only random ones depend on `seed`."""

@@ -17,14 +17,14 @@ from r2p.sim.can import CanBus, CanNode, ControllerState, Latency
 from r2p.units import MILLISECOND, SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from benchmarks.protocols.message_sets import MessageSet, SetMessage
     from benchmarks.protocols.recorder import MessageInstance
     from r2p.codecs.can_bits import AnyFrame
     from r2p.sim.can import CanController, FrameRecord
 
-SETTLED = 500 * MILLISECOND
+SETTLED = 150 * MILLISECOND
 """Ns after which it counts, where the network needs no time to start."""
 
 
@@ -111,7 +111,7 @@ class ProtocolNetwork(ABC):
         """Return the identifier, with flags, of the next sync; None: there is none."""
         return None
 
-    def configuration(self) -> dict[str, object]:
+    def configuration(self) -> Mapping[str, object]:
         """Return what each node has to know of each message of its own, by message."""
         return {}
 

@@ -111,9 +111,7 @@ class MessageOutbox:
             return
         frame = self._make(instance, self._network.payload(size))
         opens = self.opens if self.opens > now else None
-        if self.controller.request(
-            frame, self._mailbox, not_before=opens, not_after=None if last >= NEVER else last
-        ):
+        if self.controller.request(frame, self._mailbox, not_before=opens, not_after=None if last >= NEVER else last):
             self._offered = frame
             self._network.route(frame, self)
 

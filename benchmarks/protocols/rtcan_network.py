@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from benchmarks.protocols.network import ProtocolNetwork
 from r2p.codecs import rtcan
@@ -23,6 +23,8 @@ from r2p.transports.rtcan.driver import EngineDriver
 from r2p.units import MILLISECOND, SECOND
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from benchmarks.protocols.message_sets import SetMessage
     from benchmarks.protocols.network import ProtocolSetup
     from benchmarks.protocols.recorder import MessageInstance, MessageTrack
@@ -34,6 +36,13 @@ SLOTS = 60
 _NOMINAL = 10 * MILLISECOND
 _APART = 0.03  # s, between two steps while the network starts
 _LISTENED = 1.8  # s, until the last node has its id8 for sure
+
+
+class SoftHandle(NamedTuple):
+    """The value that a soft real-time message carries."""
+
+    name: str
+    instance: MessageInstance
 
 
 class RtcanNode:
@@ -50,6 +59,8 @@ class RtcanNode:
         self.granted: dict[int, int] = {}
         """True periods of the messages that have slots."""
         self.slotted: dict[int, MessageInstance] = {}
+        self.answer: asyncio.Future[int] | None = None
+        """Gets the instant at which the master next grants slots."""
         self.port = SimPort(network.shared, node)
         self.engine = Engine(
             EngineSettings(
@@ -79,10 +90,12 @@ class RtcanNode:
         if isinstance(action, Due):
             self._fill(action)
         elif isinstance(action, Done):
-            if action.fate is Fate.SENT:
-                self._network.finished(action.handle)
+            if action.fate is Fate.SENT and isinstance(action.handle, SoftHandle):
+                self._network.finished(action.handle.name, action.handle.instance)
         elif isinstance(action, SlotsGranted):
             self.granted[action.high] = action.interval
+            if self.answer is not None and not self.answer.done():
+                self.answer.set_result(self._network.bus.timeline.now())
         elif isinstance(action, Ready):
             self.driver.update_filters()
 
@@ -133,8 +146,11 @@ class SoftMessage:
         payload = random.Random(instance.released).randbytes(message.size)
         publish = node.engine.publish
         deadline = now + message.deadline
-        handle = (self.track, instance)
-        node.driver.carry_out(publish(now, self._high, payload, deadline=deadline, drop=self._drop, handle=handle))
+        node.driver.carry_out(
+            publish(
+                now, self._high, payload, deadline=deadline, drop=self._drop, handle=SoftHandle(message.name, instance)
+            )
+        )
 
 
 class RtcanNetwork(ProtocolNetwork):
@@ -209,10 +225,9 @@ class RtcanNetwork(ProtocolNetwork):
     async def add(self, name: str) -> int:
         """Ask for slots for a message while the network runs; return the instant of the answer."""
         node, high = self._places[name]
+        node.answer = asyncio.get_running_loop().create_future()
         node.reserve(high, self.tracks[name].message)
-        while high not in node.granted:
-            await asyncio.sleep(0.0001)
-        return self.bus.timeline.now()
+        return await node.answer
 
     @property
     def leader(self) -> RtcanNode | None:
@@ -239,7 +254,7 @@ class RtcanNetwork(ProtocolNetwork):
             frame = Frame(rtcan.encode_identifier(laxity, number), bytes(rtcan.FRAME_MAX))
         self.controllers[name].babble(frame)
 
-    def configuration(self) -> dict[str, object]:
+    def configuration(self) -> Mapping[str, object]:
         return {message.name: "own" for message in self.set.messages}
 
     def close(self) -> None:
@@ -247,10 +262,9 @@ class RtcanNetwork(ProtocolNetwork):
             task.cancel()
         super().close()
 
-    def finished(self, handle: object) -> None:
+    def finished(self, name: str, instance: MessageInstance) -> None:
         """Note the end of a soft real-time message."""
-        track, instance = handle  # type: ignore[misc]
-        instance.start, instance.end = self._ended[track.message.name]
+        instance.start, instance.end = self._ended[name]
 
     def observe(self, record: FrameRecord) -> None:
         frame: AnyFrame = record.frame

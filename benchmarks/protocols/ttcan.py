@@ -25,8 +25,11 @@ from r2p.codecs.can_bits import OtherFrame, other_frame_bits
 from r2p.sim.can import Latency
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from benchmarks.protocols.outbox import MessageOutbox
-    from r2p.sim.can import CanController
+    from r2p.codecs.can_bits import AnyFrame
+    from r2p.sim.can import CanController, ErrorKind
 
 MASTERS = ("time master", "second time master")
 _REFERENCE = 0x8  # its lowest 3 bits are the master's priority
@@ -73,9 +76,11 @@ class Ttcan(ProtocolNetwork):
     def sync_identifier(self) -> int | None:
         return _REFERENCE
 
-    def configuration(self) -> dict[str, object]:
+    def configuration(self) -> Mapping[str, object]:
         ranks = {message.name: rank for rank, message in enumerate(self.set.by_deadline())}
-        windows = {name: [(each.start, each.repeat, each.phase) for each in w] for name, w in self.matrix.exclusive.items()}
+        windows = {
+            name: [(each.start, each.repeat, each.phase) for each in w] for name, w in self.matrix.exclusive.items()
+        }
         return {name: (self.matrix.basic, rank, windows.get(name)) for name, rank in ranks.items()}
 
     @cached_property
@@ -160,7 +165,7 @@ class Ttcan(ProtocolNetwork):
                 state["count"] = reference.data[0] + 1
                 plan()
 
-        def again(reference: OtherFrame, *_: object) -> None:
+        def again(reference: AnyFrame, _kind: ErrorKind, _stamp: int) -> None:
             """Repeat a reference that an error destroyed, at once: for it alone, automatic retransmission is on."""
             state["due"] = master.clock.monotonic() + basic
             master.request(reference)

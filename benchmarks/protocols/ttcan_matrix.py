@@ -108,9 +108,7 @@ class SystemMatrix:
         self._take(message, added, repeat, 0)
         return True
 
-    def _take(
-        self, message: SetMessage, columns: list[tuple[int, int, list[int]]], repeat: int, phase: int
-    ) -> None:
+    def _take(self, message: SetMessage, columns: list[tuple[int, int, list[int]]], repeat: int, phase: int) -> None:
         for _, _, cells in columns:
             cells[phase::repeat] = [1] * len(cells[phase::repeat])
         self.exclusive[message.name] = [TimeWindow(start, width, repeat, phase) for start, width, _ in columns]

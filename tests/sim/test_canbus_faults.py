@@ -122,6 +122,22 @@ async def test_noise_hits_its_share_of_frames() -> None:
 
 
 @pytest.mark.virtual_time
+async def test_a_bit_error_rate_hits_long_frames_more_often_than_short_ones() -> None:
+    watch = Watch()
+    watch.bus.bit_error_rate = 0.002
+    a = watch.attach("A", one_shot=True)
+    watch.attach("B")
+    for number in range(1000):
+        await at(watch, number * 300_000)
+        a.request(Frame(FRAME.id, bytes([0x55] * 8 if number % 2 else b"")))
+    await asyncio.sleep(0.01)
+    failed = [record for record in watch.records if record.error]
+    long = sum(bool(record.frame.data) for record in failed)
+    assert 70 < long < 140  # of 500 frames of some 130 bits: 23 %
+    assert 35 < len(failed) - long < 85  # ... of some 67 bits: 12 %
+
+
+@pytest.mark.virtual_time
 async def test_noise_at_one_node_destroys_frames_for_all_until_it_is_error_passive() -> None:
     watch = Watch()
     a, deaf = watch.attach("A"), watch.attach("deaf", noise=1.0)

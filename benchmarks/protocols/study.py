@@ -1,0 +1,148 @@
+"""All cases of the study, their runs in parts, and the results as JSON. A part that has run is not run again."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from benchmarks.protocols.cases import (
+    FAULTS,
+    PROTOCOLS,
+    AddedMessage,
+    CaseFigures,
+    StudyCase,
+    add_message,
+    merge,
+    simulate,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from concurrent.futures import Executor
+    from pathlib import Path
+
+ERROR_RATES = (0.0, 1e-5, 1e-4)
+LOADS = (20, 40, 60, 80, 95)
+"""Percent, of random sets."""
+SYNCLESS = ("plain CAN, RM", "plain CAN, DM", "Cyphal", "DroneCAN")
+ADDED_TO = ("thesis-80", "sae")
+
+
+class StudyPlan(msgspec.Struct, frozen=True):
+    """How much is run: sets with their duration in s, loads and seeds of random sets, seeds of faults.
+
+    Sets of `with_errors` are also run with bit errors.
+    """
+
+    sets: dict[str, float]
+    with_errors: tuple[str, ...] = ("thesis-80", "sae")
+    loads: tuple[int, ...] = LOADS
+    load_seeds: int = 2
+    load_duration: float = 0.4
+    fault_seeds: int = 1
+
+
+FULL = StudyPlan(
+    {
+        "thesis-80": 1.0,
+        "thesis-95": 0.8,
+        "table-4.1": 1.5,
+        "sae": 2.5,
+        "broster": 1.5,
+        "vw": 1.2,
+        "hyundai": 1.2,
+        "j1939": 1.2,
+        "ford": 1.2,
+    }
+)
+QUICK = StudyPlan({"sae": 0.2}, (), (20,), 1, 0.1, 1)
+
+
+class StudyRow(msgspec.Struct, frozen=True):
+    """A case with all its seeds, and its figures."""
+
+    protocol: str
+    messages: str
+    bit_error_rate: float
+    fault: str
+    figures: CaseFigures
+
+
+class ProtocolResults(msgspec.Struct):
+    """What one protocol has to show. `added` is by set."""
+
+    protocol: str
+    plan: StudyPlan
+    rows: list[StudyRow] = []
+    added: dict[str, AddedMessage] = {}
+
+
+class StudyResults(msgspec.Struct):
+    """All protocols, in the order of the tables."""
+
+    protocols: list[ProtocolResults]
+
+    def figures(self, protocol: str, messages: str, bit_error_rate: float = 0.0, fault: str = "") -> CaseFigures | None:
+        """Return the figures of a case; None: it was not run."""
+        wanted = (protocol, messages, bit_error_rate, fault)
+        for each in self.protocols:
+            for row in each.rows:
+                if (row.protocol, row.messages, row.bit_error_rate, row.fault) == wanted:
+                    return row.figures
+        return None
+
+
+def cases_of(protocol: str, plan: StudyPlan) -> Iterator[list[StudyCase]]:
+    """Yield the cases of one protocol, all seeds of one row together."""
+    for name, duration in plan.sets.items():
+        for rate in ERROR_RATES if name in plan.with_errors else (0.0,):
+            yield [StudyCase(protocol=protocol, messages=name, bit_error_rate=rate, duration=duration)]
+    for load in plan.loads:
+        yield [
+            StudyCase(protocol=protocol, messages=f"random-{load}", seed=seed, duration=plan.load_duration)
+            for seed in range(1, plan.load_seeds + 1)
+        ]
+    for fault in FAULTS:
+        if protocol not in SYNCLESS or "babble" in fault:
+            yield [
+                StudyCase(protocol=protocol, messages="thesis-80", seed=seed, fault=fault)
+                for seed in range(1, plan.fault_seeds + 1)
+            ]
+
+
+def run_protocol(protocol: str, plan: StudyPlan, pool: Executor) -> ProtocolResults:
+    """Run all cases of one protocol."""
+    groups = list(cases_of(protocol, plan))
+    figures = iter(list(pool.map(simulate, [case for group in groups for case in group])))
+    results = ProtocolResults(protocol, plan)
+    for group in groups:
+        merged = merge([next(figures) for _ in group])
+        case = group[0]
+        results.rows.append(StudyRow(protocol, case.messages, case.bit_error_rate, case.fault, merged))
+    for name in ADDED_TO:
+        results.added[name] = add_message(protocol, name)
+    return results
+
+
+def run_study(
+    plan: StudyPlan,
+    pool: Executor,
+    cache: Path,
+    show: Callable[[str], object],
+    only: Sequence[str] = (),
+) -> StudyResults:
+    """Run what is not in the directory `cache` yet, one protocol after the other; `only` these anew."""
+    cache.mkdir(parents=True, exist_ok=True)
+    results = StudyResults([])
+    for protocol in PROTOCOLS:
+        file = cache / f"{protocol.replace(' ', '_').replace(',', '')}.json"
+        found = None
+        if protocol not in only and file.exists():
+            found = msgspec.json.decode(file.read_bytes(), type=ProtocolResults)
+        if found is None or found.plan != plan:
+            show(f"running {protocol}")
+            found = run_protocol(protocol, plan, pool)
+            file.write_bytes(msgspec.json.encode(found))
+        results.protocols.append(found)
+    return results

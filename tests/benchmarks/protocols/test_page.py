@@ -1,0 +1,43 @@
+"""docs/comparison.md shows what its results say, and the results can be had again."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+
+from benchmarks.protocols import page, pictures
+from benchmarks.protocols.cases import PROTOCOLS, StudyCase, merge, simulate
+from benchmarks.protocols.study import FULL
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_the_tables_of_the_page_are_those_of_the_results() -> None:
+    text = page.PAGE.read_text()
+    results = page.load_results()
+    assert page.filled(text, results) == text
+    assert set(re.findall(r"<!-- table: ([\w.-]+) -->", text)) == set(page.tables(results))
+
+
+def test_the_results_have_all_protocols_of_the_present_plan() -> None:
+    results = page.load_results()
+    assert [each.protocol for each in results.protocols] == list(PROTOCOLS)
+    assert all(each.plan == FULL for each in results.protocols)
+
+
+def test_the_pictures_are_those_of_the_results(tmp_path: Path) -> None:
+    pictures.draw(page.load_results(), tmp_path)
+    drawn = {each.name: each.read_text() for each in tmp_path.iterdir()}
+    assert drawn == {each.name: each.read_text() for each in page.ASSETS.glob("*.svg")}
+
+
+@pytest.mark.parametrize(
+    ("protocol", "messages"), [("plain CAN, DM", "hyundai"), ("TTCAN", "vw"), ("CANopen", "table-4.1")]
+)
+def test_a_row_of_the_results_comes_out_again(protocol: str, messages: str) -> None:
+    """A failure means that the bus or a policy has changed: run `python -m benchmarks.protocols --write` anew."""
+    case = StudyCase(protocol=protocol, messages=messages, duration=FULL.sets[messages])
+    assert merge([simulate(case)]) == page.load_results().figures(protocol, messages)
