@@ -47,19 +47,19 @@ class TokenPacker:
 
     def pop_changes(self) -> list[Declare | Undeclare]:
         """Return the keys to declare since the last call, and behind them those that end."""
-        declared: list[Declare | Undeclare] = []
-        ended: list[Declare | Undeclare] = []
+        declared, ended = dict[str, None](), dict[str, None]()
         changed, self._changed = self._changed, {}
         for pack in changed.values():
             key = liveliness.pack(list(pack.tokens)) if pack.tokens else ""
-            if key == pack.key:
-                continue
-            if key:
-                declared.append(Declare(key))
-            if pack.key:
-                ended.append(Undeclare(pack.key))
-            pack.key = key
-        return declared + ended
+            if key != pack.key:
+                declared[key] = ended[pack.key] = None
+                pack.key = key
+        # A token that was taken out and added again may have the key of before, in another pack.
+        both = (declared.keys() & ended.keys()) | {""}
+        return [
+            *(Declare(key) for key in declared if key not in both),
+            *(Undeclare(key) for key in ended if key not in both),
+        ]
 
     def withdraw_all(self) -> list[Declare | Undeclare]:
         """Undeclare everything; it is declared anew by the next `pop_changes`."""

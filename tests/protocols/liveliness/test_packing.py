@@ -41,6 +41,15 @@ def test_each_token_has_one_key(steps: list[tuple[str, bool]]) -> None:
     assert tokens_in(keys(packer.pop_changes(), set())) == sorted(there)
 
 
+def test_what_is_taken_out_and_added_again_at_once_has_been_there_all_the_time() -> None:
+    packer = TokenPacker()
+    packer.add(TOKENS[0])
+    packer.pop_changes()
+    packer.remove(TOKENS[0])
+    packer.add(TOKENS[0])
+    assert packer.pop_changes() == []
+
+
 def test_what_changes_at_once_is_one_key_and_room_is_used_again() -> None:
     packer = TokenPacker()
     for token in TOKENS:
