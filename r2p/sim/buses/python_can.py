@@ -17,25 +17,19 @@ import itertools
 from typing import TYPE_CHECKING, Any, Final
 
 import can
-from can.broadcastmanager import (
-    CyclicSendTaskABC,
-    LimitedDurationCyclicSendTaskABC,
-    ModifiableCyclicTaskABC,
-    RestartableCyclicTaskABC,
-)
 
-from r2p.clock import in_background
 from r2p.errors import Error, MessageError, TransportError
 from r2p.sim.buses import attach, channels
 from r2p.sim.buses.attachment import RX_QUEUE, AttachmentOptions, BusAttachment
 from r2p.sim.buses.can_messages import filters_of, frame_of, message_of
+from r2p.sim.buses.periodic import LoopCyclicSendTask, PeriodicMessages, ThreadCyclicSendTask
 from r2p.sim.can import ControllerState
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Callable, Iterator, Sequence
 
+    from can.broadcastmanager import CyclicSendTaskABC
     from can.typechecking import AutoDetectedConfig, CanFilters
 
 _STATES: Final = {
@@ -200,9 +194,11 @@ class R2pSimBus(can.BusABC):
         modifier_callback: Callable[[can.Message], None] | None = None,
     ) -> CyclicSendTaskABC:
         loop = self._attachment.here()
+        task: PeriodicMessages
         if loop is None:
-            return super()._send_periodic_internal(msgs, period, duration, autostart, modifier_callback)
-        task = LoopCyclicSendTask(self, loop, msgs, period, duration, modifier_callback)
+            task = ThreadCyclicSendTask(self, msgs, period, duration, modifier_callback)
+        else:
+            task = LoopCyclicSendTask(self, loop, msgs, period, duration, modifier_callback)
         if autostart:
             task.start()
         return task
@@ -228,54 +224,6 @@ class R2pSimBus(can.BusABC):
         found = channels()
         new = next(name for number in itertools.count() if (name := f"channel-{number}") not in found)
         return [{"interface": "r2psim", "channel": channel} for channel in (*found, new)]
-
-
-class LoopCyclicSendTask(LimitedDurationCyclicSendTaskABC, ModifiableCyclicTaskABC, RestartableCyclicTaskABC):
-    """Sends periodically in the event loop that runs the bus, at exact instants under virtual time. Used there only."""
-
-    def __init__(
-        self,
-        bus: R2pSimBus,
-        loop: asyncio.AbstractEventLoop,
-        messages: Sequence[can.Message] | can.Message,
-        period: float,
-        duration: float | None,
-        modifier_callback: Callable[[can.Message], None] | None,
-    ) -> None:
-        if period <= 0:
-            raise ValueError(f"a period is more than 0 s, not {period}")
-        super().__init__(messages, period, duration)
-        self._bus = bus
-        self._loop = loop
-        self._modify = modifier_callback
-        self._timer: asyncio.TimerHandle | None = None
-        self._started = 0.0
-        self._count = 0
-
-    def start(self) -> None:
-        """Send the first message now; nothing happens if it sends already."""
-        if self._timer is None:
-            self._started, self._count = self._loop.time(), 0
-            self._tick()
-
-    def stop(self) -> None:
-        """Send no more."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-
-    def _tick(self) -> None:
-        self._timer = None
-        elapsed = self._count * self.period
-        if self.duration and elapsed >= self.duration:
-            return
-        message = self.messages[self._count % len(self.messages)]
-        if self._modify is not None:
-            self._modify(message)
-        self._bus.send(message)  # an exception ends the task, as in python-can's own
-        self._count += 1
-        self._timer = self._loop.call_at(self._started + self._count * self.period, self._tick)
-        in_background(self._timer)
 
 
 def _bitrate(given: Any) -> int:

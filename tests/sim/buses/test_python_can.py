@@ -32,12 +32,28 @@ def message(identifier: int, data: bytes = b"", **more: Any) -> can.Message:
     return can.Message(arbitration_id=identifier, data=data, **more)
 
 
-def identifiers(bus: can.BusABC, count: int) -> list[int]:
+def until(condition: Callable[[], object]) -> None:
+    """Wait for what another thread does."""
+    end = time.monotonic() + SOON
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.001)
+    assert condition()
+
+
+def received(bus: can.BusABC, count: int) -> list[can.Message]:
     """Receive so many messages."""
-    found: list[int] = []
+    found: list[can.Message] = []
     while len(found) < count and (each := bus.recv(SOON)):
-        found.append(each.arbitration_id)
+        found.append(each)
     return found
+
+
+def identifiers(bus: can.BusABC, count: int) -> list[int]:
+    return [each.arbitration_id for each in received(bus, count)]
+
+
+def contents(bus: can.BusABC, count: int) -> list[bytes]:
+    return [bytes(each.data) for each in received(bus, count)]
 
 
 @pytest.fixture
@@ -223,6 +239,44 @@ def test_periodic_messages(pair: tuple[can.BusABC, can.BusABC]) -> None:
     task = a.send_periodic(message(3), 0.001)
     assert identifiers(b, 5) == [3] * 5
     task.stop()
+
+
+def test_periodic_messages_to_nobody_are_counted_and_never_a_traceback(
+    channel: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with can.Bus(interface="r2psim", channel=channel, served=False) as alone:
+        for _ in range(128):  # the first one is sent again and again, as no node acknowledges
+            alone.send(message(1))
+        task: Any = alone.send_periodic(message(3), 0.001)
+        again: Any = alone.send_periodic(message(4), 0.001)
+        until(lambda: task.lost > 2 and again.lost > 2)
+        task.stop()
+    until(lambda: not task.thread_runs and not again.thread_runs)
+    assert [each.levelname for each in caplog.records] == ["WARNING"] * 2
+    assert "is there a node that acknowledges?; messages of send_periodic are lost" in caplog.text
+    assert "Traceback" not in caplog.text
+
+
+def test_a_periodic_message_that_cannot_be_sent_ends_its_task_in_words(
+    channel: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with can.Bus(interface="r2psim", channel=channel, served=False, listen_only=True) as listener:
+        task: Any = listener.send_periodic(message(3), 0.001)
+        until(lambda: not task.thread_runs)
+    words = "this node only listens: open the bus without listen_only; send_periodic has ended"
+    assert caplog.messages == [f"{channel}: a bus of this process, 1000000 bit/s: {words}"]
+
+
+def test_a_periodic_task_in_a_thread_changes_ends_and_starts_again(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    a, b = pair
+    task: Any = a.send_periodic([message(1, b"a"), message(1, b"b")], 0.001, duration=0.0035)
+    assert contents(b, 4) == [b"a", b"b", b"a", b"b"]
+    until(lambda: not task.thread_runs)
+    task.modify_data([message(1, b"c"), message(1, b"d")])
+    task.start()
+    assert contents(b, 4) == [b"c", b"d", b"c", b"d"]
+    until(lambda: not task.thread_runs)
+    assert b.recv(0) is None
 
 
 def test_filters(pair: tuple[can.BusABC, can.BusABC]) -> None:

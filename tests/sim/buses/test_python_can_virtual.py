@@ -163,6 +163,28 @@ async def test_periodic_messages_change_end_and_start_again() -> None:
         assert identifiers(b) == []
 
 
+async def test_periodic_messages_to_nobody_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    with bus() as alone:
+        task: Any = alone.send_periodic(message(1), 0.01)
+        await asyncio.sleep(1.295)  # 128 wait, the others are lost
+        assert task.lost == 2
+        with bus() as other:
+            await asyncio.sleep(1.0)
+            assert len(list(received(other))) == 228
+        assert task.lost == 2
+    assert caplog.text.count("messages of send_periodic are lost, and counted in the task's lost") == 1
+    assert "Traceback" not in caplog.text
+
+
+async def test_a_periodic_message_after_bus_off_ends_its_task_in_words(caplog: pytest.LogCaptureFixture) -> None:
+    with bus(noise=1.0) as alone, bus():
+        task: Any = alone.send_periodic(message(1), 0.01)
+        await asyncio.sleep(1.0)
+        assert task.lost == 0
+    assert "bus off, after too many errors: restart the controller first; send_periodic has ended" in caplog.text
+    assert "Traceback" not in caplog.text
+
+
 async def test_the_period_of_a_task_is_positive() -> None:
     with bus() as a, pytest.raises(ValueError, match="more than 0 s, not 0"):
         a.send_periodic(message(1), 0)
