@@ -1,5 +1,7 @@
 """Who becomes the master and when, and the first moments of a master: on a full bus, beside another one, alone."""
 
+import itertools
+
 import pytest
 
 from r2p.codecs import can_bits, management, rtcan
@@ -311,9 +313,11 @@ def test_a_new_master_of_an_old_network_may_begin_late_and_nobody_minds() -> Non
     bus.kill(first)
     died = bus.now
 
+    numbers = itertools.count()  # a message that waits already is not queued again
+
     def chatter() -> None:
         while talker.engine.waiting < 3:
-            talker.act(talker.engine.manage(talker.now, bytes(31) + b"\xff"))
+            talker.act(talker.engine.manage(talker.now, next(numbers).to_bytes(31) + b"\xff"))
 
     while not syncs(bus, died):
         chatter()
