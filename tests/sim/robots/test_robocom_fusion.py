@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
-from r2p.sim.robots.robocom.alignment import alignment
 from r2p.sim.robots.robocom.nodes import eight
-from r2p.sim.robots.robocom.robot import InterruptLatency, Robocom
+from r2p.sim.robots.robocom.robot import Robocom
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,21 +49,3 @@ async def test_a_recording_of_a_robot_that_drives_already_begins_at_its_pose(tmp
     fuse: Callable[[str], dict[str, float]] = runpy.run_path(str(FUSION))["fuse"]
     error = fuse(str(tmp_path / "drive.mcap"))
     assert error["all three"] < 0.2 < error["GPS"]
-
-
-async def test_the_bus_itself_does_not_misalign_samples() -> None:
-    """Without a delay of the modules' software, the end of the sync is one instant, and stamps are exact."""
-    left, imu, stamp, ticks, arrival = await alignment(InterruptLatency(0.0, 0.0), seconds=2.0)
-    assert max(left.most, imu.most, stamp.most, ticks.most) < 0.1
-    assert 100 < arrival.mean < 25_000
-
-
-async def test_what_is_left_is_the_jitter_of_interrupts() -> None:
-    """That of the master, which sends the sync, and that of each module."""
-    left, imu, stamp, ticks, arrival = await alignment(seconds=2.0)
-    assert 1.0 < left.mean < left.most <= 6.0
-    assert 1.0 < imu.mean < imu.most <= 6.0
-    assert stamp.most <= 6.5
-    assert ticks.most < 6.0
-    assert str(left).startswith("left and right encoder ")
-    assert arrival.most > 100

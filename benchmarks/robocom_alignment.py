@@ -1,9 +1,11 @@
-"""How well the modules' samples are aligned, by the clock of the simulation, which is exact: the table of the page.
+"""How far apart the samples of Robocom are, by the exact clock of the simulation: a table of docs/robots/robocom.md.
 
-for row in r2p.sim.run(alignment):
-    print(row)
+    python -m benchmarks.robocom_alignment
+
+`--seconds`: of samples, in virtual time.
 """
 
+import argparse
 import asyncio
 import functools
 import statistics
@@ -13,6 +15,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 
 import r2p
+import r2p.sim
 from r2p.clock import clock_of
 from r2p.msg import StampedEncoder
 from r2p.sim.robots.robocom import nodes
@@ -107,3 +110,16 @@ def _off_line(taken: dict[int, int]) -> list[float]:
 
 def _row(what: str, apart: Sequence[float]) -> AlignmentRow:
     return AlignmentRow(what, statistics.fmean(apart) / 1000, max(apart) / 1000)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.robocom_alignment", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    seconds = parser.parse_args().seconds
+    print(f"{'us':44} {'mean':>8} {'most':>8}")
+    for row in r2p.sim.run(functools.partial(alignment, seconds=seconds)):
+        print(row)
+
+
+if __name__ == "__main__":
+    main()
