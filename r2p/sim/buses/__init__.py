@@ -4,6 +4,8 @@ Which bus a channel is, in this order: that of the thread's event loop under vir
 this process; one of another process, as `r2p bus serve` has it; a new one, in a thread of this process.
 """
 
+import msgspec
+
 from r2p.sim.buses.attachment import AttachmentOptions, BusAttachment
 from r2p.sim.buses.local import attach_here, attach_to_thread, local_channels
 from r2p.sim.buses.rendezvous import served_buses
@@ -25,9 +27,17 @@ def attach(channel: str, options: AttachmentOptions | None = None) -> BusAttachm
     return attach_to_thread(channel, options)
 
 
+def attach_if_found(channel: str, options: AttachmentOptions) -> BusAttachment | None:
+    """Attach to a bus that another process serves, or that this one has in real time; None if there is none."""
+    attachment = connect(channel, options)
+    if attachment is None and channel in local_channels():
+        return attach(channel, msgspec.structs.replace(options, served=False))
+    return attachment
+
+
 def channels() -> list[str]:
     """Return the names of the buses that there are."""
     return sorted({*local_channels(), *(each.name for each in served_buses())})
 
 
-__all__ = ["AttachmentOptions", "BusAttachment", "attach", "channels"]
+__all__ = ["AttachmentOptions", "BusAttachment", "attach", "attach_if_found", "channels"]

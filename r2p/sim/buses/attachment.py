@@ -145,6 +145,20 @@ class BusFrame(msgspec.Struct, frozen=True, gc=False):
     rx_errors: int = 0
 
 
+class BusClock:
+    """The clock of a bus, which was at `now` at the instant `since` of the computer's monotonic clock (both ns)."""
+
+    def __init__(self, now: int, since: int, speed: float = 1.0) -> None:
+        self.speed = speed
+        """How many times as fast as real time it goes."""
+        self.at, self.since = now, since
+
+    def now(self) -> int:
+        """Return the time on the bus (ns). All processes have the computer's monotonic clock."""
+        elapsed = _clock.monotonic() - self.since
+        return self.at + (elapsed if self.speed == 1.0 else round(elapsed * self.speed))
+
+
 class BusAttachment(ABC):
     """One controller at a bus. All methods may be called from any thread, at once.
 
@@ -155,6 +169,8 @@ class BusAttachment(ABC):
     """Where the bus is, for people: "lab: a bus of this process, 1000000 bit/s"."""
     bitrate: int
     """Bit/s."""
+    clock: BusClock
+    """The clock of the bus; that of a bus under virtual time does not say anything."""
 
     @abstractmethod
     def send(self, frame: AnyFrame, timeout: float | None = None) -> None:

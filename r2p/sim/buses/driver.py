@@ -6,15 +6,19 @@ All methods run in the bus's loop. `local` uses it for programs of this process,
 from collections import deque
 from collections.abc import Callable, Sequence
 
+from r2p.clock import SystemClock
 from r2p.codecs.can_bits import AnyFrame
-from r2p.sim.buses.attachment import AttachmentOptions, BusFilter, BusFrame
+from r2p.sim.buses.attachment import AttachmentOptions, BusClock, BusFilter, BusFrame
 from r2p.sim.can import BusError, CanController, CanNode, ControllerState, ErrorKind
 from r2p.sim.can.interrupts import ignore
+from r2p.sim.clocks import PacedClock
 from r2p.sim.transport import PluggedNode, SimCan
 from r2p.units import SECOND
 
 LINGER = SECOND
 """Ns for which a node stays on the bus to send its queue, after its program has left."""
+
+_computer = SystemClock()
 
 
 class BusDriver(PluggedNode):
@@ -164,6 +168,15 @@ class BusDriver(PluggedNode):
         tx, rx = self.error_counters
         utc = self.shared.utc(stamp)
         self._deliver(BusFrame(None, stamp, utc, error.sending, error.kind, error.field, tx_errors=tx, rx_errors=rx))
+
+
+def bus_clock(shared: SimCan) -> BusClock:
+    """Return the clock of a bus; under virtual time it is right now only."""
+    clock = shared.bus.timeline.clock
+    now, since = clock.monotonic(), _computer.monotonic()
+    if not clock.virtual:
+        since = now  # it is the computer's, so both are the same to the nanosecond
+    return BusClock(now, since, clock.speed if isinstance(clock, PacedClock) else 1.0)
 
 
 def node_of(options: AttachmentOptions, name: str) -> CanNode:

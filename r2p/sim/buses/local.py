@@ -33,7 +33,7 @@ from r2p.sim.buses.attachment import (
     check_filters,
     deadline_of,
 )
-from r2p.sim.buses.driver import BusDriver
+from r2p.sim.buses.driver import BusDriver, bus_clock
 from r2p.sim.can import ControllerState
 from r2p.sim.loop import VirtualLoop
 from r2p.sim.transport import SimCan, can_bus, forget_bus, running_buses
@@ -286,6 +286,7 @@ class LocalAttachment(BusAttachment):
         self._thread = threading.get_ident()
         if self._release is None:  # a loop of the program
             self._guard = self._loop.create_task(self._watch(), name="bus guard")
+        self.clock = bus_clock(shared)
         return BusDriver(shared, options, self._deliver, self._frame_left)
 
     def _stop(self) -> None:

@@ -1,4 +1,4 @@
-"""`rtcan:r2psim:NAME`: a bus that another process serves, as the port of a module or of a `BusMonitor`.
+"""`rtcan:r2psim:NAME`: a bus of another process or thread, as the port of a module or of a `BusMonitor`.
 
 Stamps are those of the bus, exact to the nanosecond, however late this process reads them.
 """
@@ -9,12 +9,12 @@ import asyncio
 import concurrent.futures
 from typing import TYPE_CHECKING, Final
 
-from r2p.clock import Backoff, random_of
+from r2p.clock import Backoff, clock_of, random_of
 from r2p.codecs.can_bits import ERROR, LOCAL, Frame, OtherFrame
 from r2p.errors import Error, TransportError
-from r2p.sim.buses import wire
+from r2p.sim.buses import attach_if_found, wire
 from r2p.sim.buses.attachment import AttachmentOptions, BusFilter
-from r2p.sim.buses.served import ServedAttachment, connect, not_served
+from r2p.sim.buses.served import not_served
 from r2p.sim.can import ControllerState
 from r2p.transports.can.port import CanPortListener, FrameTap, InterfacePort, OpenInterface
 from r2p.transports.can.rawsocket import encode_error
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from r2p.codecs.can_bits import WireFrame
     from r2p.protocols.can_orders import Mailbox
-    from r2p.sim.buses.attachment import BusFrame
+    from r2p.sim.buses.attachment import BusAttachment, BusFrame
 
 _LATENCY: Final = 1_000_000  # ns until a frame starts: the loop that serves the bus may wake up once in a millisecond
 _BATCH: Final = 64  # events that one turn of the event loop handles: other tasks wait for so long
@@ -35,7 +35,7 @@ _UNUSABLE: Final = (ControllerState.BUS_OFF, ControllerState.DOWN)
 
 
 class ServedBusPort(InterfacePort["_ServedInterface"]):
-    """A node of its own on the bus that another process serves under this name."""
+    """A node of its own on the bus that another process serves under this name, or that this one has in real time."""
 
     transmit_latency = _LATENCY
     coarse = True
@@ -51,6 +51,9 @@ class ServedBusPort(InterfacePort["_ServedInterface"]):
         return self._clock()
 
     async def run(self, listener: CanPortListener, opened: Callable[[], object]) -> None:
+        clock = clock_of()
+        if getattr(clock, "virtual", False) and not getattr(clock, "paced", False):
+            raise TransportError(f"rtcan:{self.name} is a bus in real time: under virtual time use sim:{self._channel}")
         backoff = Backoff(random_of(), longest=_RETRY_MAX)
         attachment = await self._connect()
         if attachment is None:
@@ -66,8 +69,8 @@ class ServedBusPort(InterfacePort["_ServedInterface"]):
             await asyncio.sleep(backoff.delay())
             attachment = await self._connect()
 
-    async def _connect(self) -> ServedAttachment | None:
-        """Connect in a thread, as a server may hesitate. Raises TransportError if it refuses."""
+    async def _connect(self) -> BusAttachment | None:
+        """Connect in a thread, as a server may hesitate, and a loop of this process. Raises TransportError."""
         options = AttachmentOptions(
             name="monitor" if self.listen_only else "port",
             bitrate=self._bitrate,
@@ -76,7 +79,7 @@ class ServedBusPort(InterfacePort["_ServedInterface"]):
             errors=True,
         )
         with concurrent.futures.ThreadPoolExecutor(1, "r2psim") as thread:
-            attachment = await asyncio.wrap_future(thread.submit(connect, self._channel, options))
+            attachment = await asyncio.wrap_future(thread.submit(attach_if_found, self._channel, options))
         if attachment is not None and not self.listen_only and attachment.clock.speed != 1.0:
             attachment.close()
             raise TransportError(
@@ -84,7 +87,7 @@ class ServedBusPort(InterfacePort["_ServedInterface"]):
             )
         return attachment
 
-    async def _serve(self, attachment: ServedAttachment, listener: CanPortListener) -> None:
+    async def _serve(self, attachment: BusAttachment, listener: CanPortListener) -> None:
         bus = _ServedInterface(attachment, listener, self.tap)
         bus.start()
         try:
@@ -97,7 +100,7 @@ class ServedBusPort(InterfacePort["_ServedInterface"]):
 class _ServedInterface(OpenInterface):
     """An attachment to the bus, while it works."""
 
-    def __init__(self, attachment: ServedAttachment, listener: CanPortListener, tap: FrameTap | None) -> None:
+    def __init__(self, attachment: BusAttachment, listener: CanPortListener, tap: FrameTap | None) -> None:
         super().__init__(listener, latency=_LATENCY, confirm_timeout=SECOND)
         self._attachment = attachment
         self._tap = tap

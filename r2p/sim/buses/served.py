@@ -22,7 +22,7 @@ from r2p.codecs.can_bits import check_frame
 from r2p.errors import Closed, DecodeError, Error, TransportError
 from r2p.log_lines import get_logger
 from r2p.sim.buses import rendezvous, wire
-from r2p.sim.buses.attachment import TX_QUEUE, BusAttachment, BusFrame, check_filters, deadline_of
+from r2p.sim.buses.attachment import TX_QUEUE, BusAttachment, BusClock, BusFrame, check_filters, deadline_of
 from r2p.sim.can import ControllerState
 from r2p.units import SECOND
 
@@ -114,20 +114,6 @@ def _read(connection: socket.socket, size: int) -> bytes:
     return data
 
 
-class BusClock:
-    """The clock of a bus of another process."""
-
-    def __init__(self, description: wire.BusDescription) -> None:
-        self.speed = description.speed
-        """How many times as fast as real time it goes."""
-        self._now, self._since = description.now, description.since
-
-    def now(self) -> int:
-        """Return the time on the bus (ns). Both processes have the computer's monotonic clock."""
-        elapsed = _clock.monotonic() - self._since
-        return self._now + (elapsed if self.speed == 1.0 else round(elapsed * self.speed))
-
-
 class ServedAttachment(BusAttachment):
     """A controller at the bus of another process."""
 
@@ -141,7 +127,7 @@ class ServedAttachment(BusAttachment):
         self.bitrate = description.bitrate
         self.node = description.node
         """The name of this attachment's node on the bus."""
-        self.clock = BusClock(description)
+        self.clock = BusClock(description.now, description.since, description.speed)
         self.description = f"{served.name}: a bus of process {served.pid}, {self.bitrate} bit/s"
         self._name, self._pid = served.name, served.pid
         self._connection = connection

@@ -18,13 +18,12 @@ from typing import TYPE_CHECKING, Final, cast
 
 import msgspec
 
-from r2p.clock import SystemClock, clock_of, real_time
+from r2p.clock import clock_of, real_time
 from r2p.errors import DecodeError, Error, TransportError
 from r2p.log_lines import LineLimit, get_logger
 from r2p.sim.buses import rendezvous, wire
 from r2p.sim.buses.attachment import TX_QUEUE, AttachmentOptions
-from r2p.sim.buses.driver import BusDriver
-from r2p.sim.clocks import PacedClock
+from r2p.sim.buses.driver import BusDriver, bus_clock
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -48,7 +47,6 @@ _STRANGERS_MAX: Final = 64  # connections that have not sent the secret yet
 _GREETING_TIMEOUT: Final = 5.0  # seconds
 _MESSAGE_MAX: Final = 1 << 13  # bytes of a message of a client: more than TX_QUEUE frames, or FILTERS_MAX filters
 _BUFFER_MAX: Final = 1 << 16  # bytes of events that wait in a connection before they wait here
-_computer: Final = SystemClock()
 
 
 class BusServer:
@@ -100,12 +98,8 @@ class BusServer:
 
     def describe(self, driver: BusDriver) -> wire.BusDescription:
         """Return what a client learns of the bus."""
-        clock = self.can.bus.timeline.clock
-        speed = clock.speed if isinstance(clock, PacedClock) else 1.0
-        now, since = clock.monotonic(), _computer.monotonic()
-        if not clock.virtual:
-            since = now  # it is the computer's, so both are the same to the nanosecond
-        return wire.BusDescription(self.can.bitrate, driver.controller.name, now, since, speed)
+        clock = bus_clock(self.can)
+        return wire.BusDescription(self.can.bitrate, driver.controller.name, clock.at, clock.since, clock.speed)
 
     def disconnected(self, client: ServedClient, driver: BusDriver | None) -> None:
         self._strangers.pop(client, None)

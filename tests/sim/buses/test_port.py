@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 import pytest
 
+import r2p
+import r2p.sim
 from r2p.bus import BusMonitor, FrameKind
 from r2p.codecs.can_bits import Frame, OtherFrame
 from r2p.errors import TransportError
+from r2p.msg import Led
 from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.recording.frame_recorder import FrameRecorder
 from r2p.sim import can_bus
-from r2p.sim.buses.attachment import AttachmentOptions
+from r2p.sim.buses import AttachmentOptions, attach
 from r2p.sim.buses.driver import BusDriver
 from r2p.sim.buses.port import ServedBusPort
 from r2p.sim.buses.server import serve_bus
@@ -21,6 +25,7 @@ from r2p.sim.can import ErrorKind, FrameRecord
 from r2p.sim.clocks import PacedClock
 from r2p.sim.loop import VirtualLoop
 from r2p.sim.transport import SimCan
+from r2p.testing.network import node_in
 from r2p.transports.url import open_transport
 
 if TYPE_CHECKING:
@@ -30,6 +35,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.anyio
 PATIENCE = 30.0  # seconds
 VIA = "rtcan:r2psim:lab"
+HERE = AttachmentOptions(served=False)
 
 
 @pytest.fixture(autouse=True)
@@ -92,6 +98,62 @@ async def test_a_bus_that_no_program_serves_is_an_error_at_once() -> None:
     with pytest.raises(TransportError, match="no program serves the bus lab: start it with r2p bus serve lab"):
         async with BusMonitor(VIA):
             pass
+
+
+def test_under_virtual_time_the_error_names_the_bus_of_the_loop() -> None:
+    async def main() -> None:
+        with pytest.raises(
+            TransportError, match="rtcan:r2psim:lab is a bus in real time: under virtual time use sim:lab"
+        ):
+            await ServedBusPort("lab", 1_000_000).run(Listener(), lambda: None)
+
+    r2p.sim.run(main)
+
+
+async def test_a_bus_in_a_thread_of_this_process_is_seen_with_its_exact_times() -> None:
+    with closing(attach("lab", HERE)) as a, closing(attach("lab", HERE)) as b:
+        async with BusMonitor(VIA) as monitor:
+            a.send(Frame(1, b"abc"))
+            async with asyncio.timeout(PATIENCE):
+                seen = await anext(aiter(monitor))
+            event = await asyncio.to_thread(b.receive, PATIENCE)
+        assert event is not None
+        assert (seen.frame, seen.stamp) == (event.frame, event.end)
+        assert monitor.since <= seen.stamp
+        a.send(Frame(2, b""))  # the bus goes on without the monitor
+        event = await asyncio.to_thread(b.receive, PATIENCE)
+        assert event is not None
+        assert event.frame == Frame(2, b"")
+    with pytest.raises(TransportError, match="no program serves the bus lab"):
+        async with BusMonitor(VIA):
+            pass
+
+
+async def test_a_bus_of_this_event_loop_is_seen_too() -> None:
+    can = can_bus("lab")
+    a, _ = node(can, "a"), node(can, "b")
+    async with BusMonitor(VIA) as monitor:
+        send(a, Frame(1, b"abc"))
+        async with asyncio.timeout(PATIENCE):
+            assert (await anext(aiter(monitor))).frame == Frame(1, b"abc")
+
+
+async def test_a_module_uses_a_bus_in_a_thread_of_this_process() -> None:
+    with closing(attach("lab", HERE)) as spy:
+        async with (
+            r2p.Module("A", via=VIA, watchdog=False) as module_a,
+            r2p.Module("B", via="sim:lab", watchdog=False) as module_b,
+            node_in(module_a) as alice,
+            node_in(module_b) as bob,
+        ):
+            publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
+            await publisher.wait_subscriber()
+            fetching = asyncio.create_task(subscriber.fetch())
+            while not fetching.done():  # a busy computer loses its master, and events with it
+                await publisher.publish(Led(led=7))
+                await asyncio.wait([fetching], timeout=0.1)
+            assert fetching.result() == Led(led=7)
+        assert spy.receive(0) is not None
 
 
 async def test_another_bit_rate_is_an_error() -> None:
