@@ -13,6 +13,7 @@ A robot of its own is a class with a plant, and with a plan for each board:
 
 import asyncio
 import contextlib
+import random
 from collections.abc import Callable, Iterable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, ClassVar, Self, TypedDict
@@ -32,6 +33,17 @@ if TYPE_CHECKING:
 
 _POLL = 0.02  # s
 _SETTLED = 0.5  # s for which everything has to stay ready
+
+
+class RobotHardware:
+    """What a robot is without its modules, as the base of its own: `seed` is that of all random numbers."""
+
+    def __init__(self, seed: object) -> None:
+        self.seed = seed
+
+    def noise(self, part: str) -> random.Random:
+        """Return the random numbers for a part: the same for each seed, whatever other parts there are."""
+        return random.Random(f"{self.seed}/{part}")
 
 
 class BoardPlan(msgspec.Struct, frozen=True):

@@ -15,7 +15,6 @@ import asyncio
 import enum
 import functools
 import math
-import random
 from typing import TYPE_CHECKING, Any, Unpack
 
 import msgspec
@@ -37,7 +36,7 @@ from r2p.sim.physics.motor import Drive, LeadBattery, Motor, rounded_gains, spee
 from r2p.sim.physics.ultrasonic import Beam, SonarSpec, echo
 from r2p.sim.physics.world import OmniBody, Triple, World
 from r2p.sim.robots import triskar2
-from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotOptions
+from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotHardware, RobotOptions
 from r2p.sim.robots.shared_nodes import BATTERY, TIMEOUT, Traffic, battery_monitor
 from r2p.transports.link import Transport
 
@@ -78,12 +77,12 @@ _BEAM = (-8.0, 0.0, 8.0)  # degrees: rays that model the width of a sensor's bea
 _ELECTRONICS = 0.25  # A: the current of the modules
 
 
-class Hardware:
+class Hardware(RobotHardware):
     """The body, its motors and its battery in the world: everything that is not a module."""
 
     def __init__(self, seed: object = 0, world: World | None = None) -> None:
         """`seed`: of all random numbers."""
-        self.seed = seed
+        super().__init__(seed)
         self.world = world or World()
         self.motors = [Motor(triskar2.MOTOR) for _ in MOTORS]
         self.body = OmniBody(triskar2.BODY, self.motors, self.noise("body"))
@@ -111,10 +110,6 @@ class Hardware:
         """Let a part take part, from now on: sensors that no module reads cost nothing."""
         if part not in self.plant.parts:
             self.plant.parts.append(part)
-
-    def noise(self, part: str) -> random.Random:
-        """Return the random numbers for a part."""
-        return random.Random(f"{self.seed}/{part}")
 
     def distance_to_wall(self, angle: float) -> float:
         """Return the distance (mm) to the nearest wall in a range finder's beam; `angle` in degrees from ahead."""

@@ -1,11 +1,14 @@
 """What `r2p sim` knows of each robot: how to make it, how to drive it for a demonstration, and what to show of it."""
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from typing import ClassVar, Generic, TypeVar, Unpack
 
 from rich.text import Text
 
 import r2p
+from r2p.sim.physics.world import Triple
 from r2p.sim.robots.base import EmulatedRobot, RobotOptions
 from r2p.sim.robots.figures import OdometryFigures, WheelFigures
 
@@ -72,8 +75,29 @@ class RobotDisplay(ABC, Generic[B]):
 # Lines about what several robots have
 
 
-def odometry_line(odometry: OdometryFigures) -> str:
+def drive_lines(pose: Triple, odometry: OdometryFigures | None, wheels: Iterable[WheelFigures]) -> list[str]:
+    """Return lines about where a robot on wheels is, where it believes to be, and what its wheels do."""
+    # Position and odometry of one instant, so that they can be compared: in 0.1 s the robot drives 5 cm.
+    x, y, w = odometry.truth if odometry and odometry.fresh else pose
+    return [
+        f"position  x {x:z6.2f}  y {y:z6.2f} m  heading {math.degrees(w):z4.0f} deg",
+        odometry_line(odometry),
+        WHEELS,
+        *(wheel_line(wheel) for wheel in wheels),
+    ]
+
+
+def drive_summary(path: float, pose: Triple, odometry: OdometryFigures | None, off_max: float) -> list[str]:
+    """Return lines about how far a robot on wheels drove, where it is (m), and how good its odometry was."""
+    x, y, _ = pose
+    lines = [f"{path:.2f} m driven; the robot is at x {x:.3f}, y {y:.3f} m"]
+    return lines if odometry is None else [*lines, odometry_accuracy(odometry, off_max)]
+
+
+def odometry_line(odometry: OdometryFigures | None) -> str:
     """Return a line about the last odometry, and how far it is off."""
+    if odometry is None:
+        return "odometry  nothing yet"
     note = f"off by {odometry.off * 1000:.0f} mm" if odometry.fresh else f"{odometry.age:.1f} s ago"
     return f"odometry  x {odometry.pose.x:z6.2f}  y {odometry.pose.y:z6.2f} m  {note}"
 

@@ -86,7 +86,7 @@ class HexapodDisplay(RobotDisplay[HexapodFigures]):
         volts, amperes, charge = body.battery
         return [
             f"position  x {x:z6.2f}  y {y:z6.2f} m  heading {math.degrees(w):z4.0f} deg",
-            "odometry  nothing yet" if body.odometry is None else odometry_line(body.odometry),
+            odometry_line(body.odometry),
             *(_leg_line(name, leg) for name, leg in zip(nodes.LEGS, body.legs, strict=True)),
             f"battery   {volts:.1f} V  {amperes:.1f} A  {charge:.0%}  height {body.height * 1000:.0f} mm",
         ]

@@ -17,15 +17,7 @@ from r2p.sim.robots.base import RobotOptions
 from r2p.sim.robots.figures import OdometryCheck, OdometryFigures, WheelFigures, wheel_figures
 from r2p.sim.robots.robocom.nodes import eight
 from r2p.sim.robots.robocom.robot import MOTORS, Robocom
-from r2p.tools.sim.display import (
-    PICTURE_HEIGHT,
-    PICTURE_WIDTH,
-    WHEELS,
-    RobotDisplay,
-    odometry_accuracy,
-    odometry_line,
-    wheel_line,
-)
+from r2p.tools.sim.display import PICTURE_HEIGHT, PICTURE_WIDTH, RobotDisplay, drive_lines, drive_summary
 from r2p.tools.sim.world_map import WorldMap, coloured
 from r2p.units import SECOND
 
@@ -127,15 +119,10 @@ class RobocomDisplay(RobotDisplay[RobocomFigures]):
         )
 
     def state(self, body: RobocomFigures) -> list[str]:
-        # Position and odometry of one instant, as on the screen of Triskar2.
-        x, y, w = body.odometry.truth if body.odometry and body.odometry.fresh else body.pose
         turn, ahead = body.inertial
         volts, amperes, charge = body.battery
         return [
-            f"position  x {x:z6.2f}  y {y:z6.2f} m  heading {math.degrees(w):z4.0f} deg",
-            "odometry  nothing yet" if body.odometry is None else odometry_line(body.odometry),
-            WHEELS,
-            *(wheel_line(wheel) for wheel in body.wheels),
+            *drive_lines(body.pose, body.odometry, body.wheels),
             f"IMU       turn {turn:z6.1f} deg/s  ahead {ahead:z5.2f} m/s^2",
             f"GPS       {_gps_state(body.gps)}",
             f"battery   {volts:.1f} V  {amperes:.1f} A  {charge:.0%}",
@@ -153,10 +140,7 @@ class RobocomDisplay(RobotDisplay[RobocomFigures]):
         return f"at {x:z5.2f} {y:z5.2f} m {math.degrees(w):z4.0f} deg  GPS {off}"
 
     def summary(self, body: RobocomFigures) -> list[str]:
-        x, y, _ = body.pose
-        lines = [f"{body.path:.2f} m driven; the robot is at x {x:.3f}, y {y:.3f} m"]
-        if body.odometry is not None:
-            lines.append(odometry_accuracy(body.odometry, body.off_max))
+        lines = drive_summary(body.path, body.pose, body.odometry, body.off_max)
         if body.gps_off:
             lines.append(f"GPS: off by {body.gps_off:.2f} m (root of the mean square)")
         return lines

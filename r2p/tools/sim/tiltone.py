@@ -126,7 +126,7 @@ class TiltOneDisplay(RobotDisplay[TiltOneFigures]):
             f"tilt      {math.degrees(body.tilt):z6.2f} deg    {wanted:12}  {body.status}",
             f"speed     {body.speed:z6.2f} m/s    wanted {speed or '    none'}",
             f"turn      {body.turn:z6.2f} rad/s  wanted {turn or '    none'}",
-            "odometry  nothing yet" if body.odometry is None else odometry_line(body.odometry),
+            odometry_line(body.odometry),
             *(_wheel_line(wheel, body.unit) for wheel in body.wheels),
             f"battery   {volts:6.1f} V  {amperes:z5.1f} A  {charge:4.0%}  delay {body.age * 1000:.1f} ms",
         ]

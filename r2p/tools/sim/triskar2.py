@@ -13,15 +13,7 @@ from r2p.sim.robots.base import RobotOptions
 from r2p.sim.robots.emulated import MOTORS, Triskar2
 from r2p.sim.robots.figures import OdometryCheck, OdometryFigures, WheelFigures, wheel_figures
 from r2p.sim.robots.triskar2 import square
-from r2p.tools.sim.display import (
-    PICTURE_HEIGHT,
-    PICTURE_WIDTH,
-    WHEELS,
-    RobotDisplay,
-    odometry_accuracy,
-    odometry_line,
-    wheel_line,
-)
+from r2p.tools.sim.display import PICTURE_HEIGHT, PICTURE_WIDTH, RobotDisplay, drive_lines, drive_summary
 from r2p.tools.sim.world_map import WorldMap, coloured
 
 _SIDE, _SPEED, _WAIT = 2.0, 0.5, 1.0  # the square: m, m/s, and seconds until it starts; one lap takes 18 s
@@ -78,14 +70,9 @@ class Triskar2Display(RobotDisplay[Triskar2Figures]):
         )
 
     def state(self, body: Triskar2Figures) -> list[str]:
-        # Position and odometry of one instant, so that they can be compared: in 0.1 s the robot drives 5 cm.
-        x, y, w = body.odometry.truth if body.odometry and body.odometry.fresh else body.pose
         volts, amperes, charge = body.battery
         return [
-            f"position  x {x:z6.2f}  y {y:z6.2f} m  heading {math.degrees(w):z4.0f} deg",
-            "odometry  nothing yet" if body.odometry is None else odometry_line(body.odometry),
-            WHEELS,
-            *(wheel_line(wheel) for wheel in body.wheels),
+            *drive_lines(body.pose, body.odometry, body.wheels),
             f"battery   {volts:.1f} V  {amperes:.1f} A  {charge:.0%}",
             *([] if body.attitude is None else [_attitude_line(*body.attitude)]),
             *([f"leds      {body.leds}"] if body.leds else []),
@@ -103,11 +90,7 @@ class Triskar2Display(RobotDisplay[Triskar2Figures]):
         return f"at {x:z5.2f} {y:z5.2f} m {math.degrees(w):z4.0f} deg  wheels {speeds}"
 
     def summary(self, body: Triskar2Figures) -> list[str]:
-        x, y, _ = body.pose
-        lines = [f"{body.path:.2f} m driven; the robot is at x {x:.3f}, y {y:.3f} m"]
-        if body.odometry is not None:
-            lines.append(odometry_accuracy(body.odometry, body.off_max))
-        return lines
+        return drive_summary(body.path, body.pose, body.odometry, body.off_max)
 
     def hints(self, url: str, *, driven: bool) -> list[str]:
         return [] if driven else [f"topic pub velocity_cmd x=0.2 -r 20 --via {url}"]

@@ -10,7 +10,6 @@ On a simulated bus each module has a crystal of its own, and takes a while to no
 
 import functools
 import math
-import random
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, Unpack
 
 import msgspec
@@ -26,7 +25,7 @@ from r2p.sim.physics.gps import GpsReceiver, GpsSpec, GpsTruth
 from r2p.sim.physics.inertial import GRAVITY
 from r2p.sim.physics.motor import Drive, LeadBattery, Motor, rounded_gains, speed_gains
 from r2p.sim.physics.world import Triple
-from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotOptions
+from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotHardware, RobotOptions
 from r2p.sim.robots.robocom import nodes
 from r2p.sim.robots.shared_nodes import TIMEOUT, battery_monitor
 from r2p.transports.link import Transport
@@ -63,12 +62,12 @@ class SampleTaken(NamedTuple):
     at: int
 
 
-class RobocomHardware:
+class RobocomHardware(RobotHardware):
     """The body, its motors, sensors and battery: everything that is not a module."""
 
     def __init__(self, seed: object = 0, gps: GpsSpec | None = None) -> None:
         """`seed`: of all random numbers. The clock of the GPS is that of the running loop."""
-        self.seed = seed
+        super().__init__(seed)
         self.clock = clock_of()
         self.motors = [Motor(nodes.MOTOR) for _ in MOTORS]
         self.body = DifferentialBody(nodes.BODY, self.motors, self.noise("body"))
@@ -100,10 +99,6 @@ class RobocomHardware:
         """Read the inertial sensors."""
         self._sampled("IMU1", self.clock.monotonic())
         return self.unit.raw()
-
-    def noise(self, part: str) -> random.Random:
-        """Return the random numbers for a part."""
-        return random.Random(f"{self.seed}/{part}")
 
     def _sampled(self, module: str, at: int) -> None:
         if self.samples is not None:

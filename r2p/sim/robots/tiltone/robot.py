@@ -12,7 +12,6 @@ Hands hold it upright at first, as its modules take a while to start.
 import asyncio
 import functools
 import math
-import random
 from collections.abc import Callable
 from typing import Any, NamedTuple, Unpack
 
@@ -33,7 +32,7 @@ from r2p.sim.physics.inertial import (
 from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor
 from r2p.sim.physics.pendulum import Pendulum
 from r2p.sim.physics.world import Triple
-from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotOptions
+from r2p.sim.robots.base import BoardPlan, EmulatedRobot, RobotHardware, RobotOptions
 from r2p.sim.robots.shared_nodes import BATTERY, Traffic, battery_monitor, forward_kinematics
 from r2p.sim.robots.tiltone import nodes
 from r2p.transports.link import Transport
@@ -84,12 +83,12 @@ class InputAges:
         return self._sum / self.count if self.count else 0.0
 
 
-class TiltOneHardware:
+class TiltOneHardware(RobotHardware):
     """The body, its motors, its battery and its inertial sensors: everything that is not a module."""
 
     def __init__(self, seed: object = 0, spec: nodes.BalanceSpec = nodes.GEARED, payload: float = 0.0) -> None:
         """`seed`: of all random numbers. `payload` in kg."""
-        self.seed = seed
+        super().__init__(seed)
         self.spec = spec
         self.motors = [Motor(spec.motor) for _ in MOTORS]
         self.body = Pendulum(msgspec.structs.replace(spec.body, payload=payload), *self.motors)
@@ -117,10 +116,6 @@ class TiltOneHardware:
         """Hold the robot, and turn it upright."""
         self.body.held = True
         self._raising = -self.body.tilt / seconds
-
-    def noise(self, part: str) -> random.Random:
-        """Return the random numbers for a part."""
-        return random.Random(f"{self.seed}/{part}")
 
     def _raise(self, dt: float) -> None:
         left = -self.body.tilt
