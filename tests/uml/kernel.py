@@ -30,6 +30,8 @@ _HERE = Path(__file__).parent
 _CONSOLE = "console"
 _PR_SET_PDEATHSIG = 1
 _TAIL = 4000  # characters of the console in a message
+_WIDE = "amx_tile"
+"""What /proc/cpuinfo says of a processor with more registers than the kernel has room for: see registers.c."""
 
 
 class KernelFailed(Exception):
@@ -92,7 +94,7 @@ def _boot(tools: Tools, shared: Path, limit: float) -> str:
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            env={**os.environ, "TMPDIR": str(_memory_folder(shared))},
+            env={**os.environ, "TMPDIR": str(_memory_folder(shared)), **_preloaded(shared)},
             start_new_session=True,  # it is several processes, which end together
             preexec_fn=_end_with_parent,
         )
@@ -105,6 +107,17 @@ def _boot(tools: Tools, shared: Path, limit: float) -> str:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
     return ""
+
+
+def _preloaded(shared: Path) -> dict[str, str]:
+    """What the kernel needs in its environment to run on this processor. Raises `KernelFailed` without a compiler."""
+    if _WIDE not in Path("/proc/cpuinfo").read_text(encoding="ascii").split():
+        return {}
+    library, compiler = shared / "registers.so", shutil.which("cc")
+    if compiler is None:
+        raise KernelFailed("this processor has registers that the kernel does not know: install gcc")
+    subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", library, _HERE / "registers.c"], check=True)
+    return {"LD_PRELOAD": str(library)}
 
 
 def _end_with_parent() -> None:
