@@ -12,7 +12,7 @@ sets as CSV and TOML, `dbc` as DBC files. The command `r2p bus analyze` uses it.
 """
 
 from r2p.analysis.laxity import EventModel, control_rates, event_bounds, event_breakdown, management_load
-from r2p.analysis.messages import BusMessage, MessageClass, bit_time, check_message, utilisation
+from r2p.analysis.messages import BusMessage, MessageClass, Urgency, bit_time, check_message, utilisation
 from r2p.analysis.priority import (
     Breakdown,
     FaultModel,
@@ -33,6 +33,7 @@ __all__ = [
     "ResponseBound",
     "SlotAccuracy",
     "SlotSupply",
+    "Urgency",
     "bit_time",
     "breakdown",
     "check_message",

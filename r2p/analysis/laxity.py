@@ -19,7 +19,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 
 import msgspec
 
-from r2p.analysis.messages import BusMessage, MessageClass
+from r2p.analysis.messages import BusMessage, MessageClass, Urgency
 from r2p.analysis.priority import Breakdown, ResponseBound
 from r2p.analysis.slots import SlotSupply
 from r2p.codecs import management
@@ -63,13 +63,17 @@ def management_load(control: Mapping[str, float], other: float = 0.0) -> list[Bu
 
     `control`: by node, the messages a second that keep slots and the network, with a deadline of 10 ms. `other`: those
     of discovery and services of each node, with 50 ms; a control message may have to wait for one of them that has
-    started. `control_rates` has the rates of RTCAN itself; `r2p bus load` shows what a live bus carries, in frames, of
-    which a message has four.
+    started, and is as urgent as those that wait behind it. `control_rates` has the rates of RTCAN itself; `r2p bus
+    load` shows what a live bus carries, in frames, of which a message has four.
     """
-    size = management.SIZE * (2 if other else 1)
-    found = [_burst(f"control of {node}", node, size, CONTROL_DEADLINE, rate) for node, rate in control.items()]
+    size, urgency = (management.SIZE * 2, Urgency.LENT) if other else (management.SIZE, Urgency.OWN)
+    found = [
+        _burst(f"control of {node}", node, size, CONTROL_DEADLINE, rate, urgency) for node, rate in control.items()
+    ]
     if other:
-        found += [_burst(f"management of {node}", node, management.SIZE, DEADLINE, other) for node in control]
+        found += [
+            _burst(f"management of {node}", node, management.SIZE, DEADLINE, other, Urgency.EASED) for node in control
+        ]
     return found
 
 
@@ -83,7 +87,7 @@ def control_rates(nodes: Iterable[str], owners: Container[str], master: str = ""
     return rates | {master or "the master": rates.get(master, 0.0) + lead}
 
 
-def _burst(name: str, node: str, size: int, deadline: int, rate: float) -> BusMessage:
+def _burst(name: str, node: str, size: int, deadline: int, rate: float, urgency: Urgency) -> BusMessage:
     period = round(SECOND / rate)
     return BusMessage(
         name=name,
@@ -93,6 +97,7 @@ def _burst(name: str, node: str, size: int, deadline: int, rate: float) -> BusMe
         jitter=(math.ceil(rate) - 1) * period,
         deadline=deadline,
         message_class=MessageClass.SRT,
+        urgency=urgency,
     )
 
 
@@ -136,7 +141,6 @@ class _Events:
         self._ordered = model.ordered
         self._bit = supply.timing.bit
         self._quantum = MILLISECOND + model.latency
-        self._last_slots = (self._quantum + model.latency) // supply.timing.slot + 1  # in a last millisecond
         self._messages = [each for each in messages if each.message_class in {MessageClass.SRT, MessageClass.NRT}]
         self._loads = [
             _Load(each, each.frames * model.frame_slots, each.period, each.jitter, each.deadline or each.period)
@@ -245,14 +249,15 @@ class _Events:
         """
         own = ((last + load.jitter) // load.period + 1) * load.slots
         tail = self._latency + load.message.longest * self._bit
+        last_slots = (self._last(load) + self._latency) // self._supply.timing.slot + 1
         response = 0
         while True:
             decided = last + response - tail + self._latency + self._bit
-            hurries = response > load.deadline - self._quantum  # in its last millisecond it may lose ties as well
+            hurries = response > load.deadline - self._last(load)  # it may lose ties as well
             slots = own + sum(each.load.within(min(decided, each.until) - each.since) for each in rivals)
             ties = decided if hurries else last
             tied = sum(each.load.within(min(ties, each.tied_until) - each.tied_since) for each in rivals)
-            late = min(tied, self._last_slots) if hurries else 0
+            late = min(tied, last_slots) if hurries else 0
             from_start, from_arrival = self._supply.wait(slots + tied), self._supply.wait(slots + late)
             assert from_start is not None
             assert from_arrival is not None
@@ -263,6 +268,10 @@ class _Events:
                 return None
             response = found
 
+    def _last(self, load: _Load) -> int:
+        """Return for how long a message has one laxity before its deadline (ns): a millisecond, discovery two."""
+        return self._quantum * (2 if load.message.urgency is Urgency.EASED else 1)
+
     def _rivals(self, load: _Load, loads: list[_Load], first: int, last: int) -> list[_Rival]:
         """Return what may win slots against a message that arrives between two instants after a busy period began."""
         early, late = first + load.deadline + self._quantum, last + load.deadline + self._quantum
@@ -272,7 +281,10 @@ class _Events:
                 longest = -(each.bound or 0)  # what waited longer before the busy period would have been late
                 since = 0 if late <= _CLAMPED else max(min(0, _CLAMPED - each.deadline), longest)
                 tied_since, until = max(early - each.deadline, longest), late - each.deadline
-                found.append(_Rival(each, since, until, tied_since, until + self._quantum))
+                tied_until = until + self._last(load)
+                if each.message.urgency is Urgency.LENT:  # whenever it arrives, it may win
+                    since, until, tied_until = min(since, tied_since), late, tied_since
+                found.append(_Rival(each, since, until, tied_since, tied_until))
         return found
 
 

@@ -33,6 +33,17 @@ class MessageClass(enum.Enum):
     """Non real-time on RTCAN: in free slots, behind all soft real-time messages."""
 
 
+class Urgency(enum.Enum):
+    """How urgent a soft real-time message is on RTCAN, by its deadline."""
+
+    OWN = "own"
+    """As its own deadline says."""
+    LENT = "lent"
+    """Also as the discovery of its node that waits behind it: up to any."""
+    EASED = "eased"
+    """In its last two milliseconds as with two left, and so when it is overdue: discovery (PROTOCOL.md 6)."""
+
+
 class BusMessage(msgspec.Struct, frozen=True, kw_only=True):
     """A message that is sent at most once a `period`, within `jitter` of that, and has to be through by `deadline`.
 
@@ -40,6 +51,7 @@ class BusMessage(msgspec.Struct, frozen=True, kw_only=True):
     `period` None: nobody knows how often it is sent. `deadline` counts from when the message should have been queued
     without jitter (plain CAN), or from when it is published (RTCAN); None: it has none. `bits`: the length of its
     longest frame without intermission, where that is known; None: as many stuff bits as any content can have.
+    `urgency` is that of RTCAN's own messages, which `management_load` returns.
     """
 
     name: str
@@ -52,6 +64,7 @@ class BusMessage(msgspec.Struct, frozen=True, kw_only=True):
     extended: bool = False
     message_class: MessageClass = MessageClass.PLAIN
     bits: int | None = None
+    urgency: Urgency = Urgency.OWN
 
     @property
     def frames(self) -> int:

@@ -2,14 +2,17 @@
 
 import random
 
+import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.analysis.sets import compare_rtcan
 from r2p.analysis import (
     BusMessage,
     EventModel,
     MessageClass,
+    Urgency,
     control_rates,
     event_bounds,
     event_breakdown,
@@ -19,7 +22,6 @@ from r2p.analysis import (
 from r2p.protocols.rtcan.calendar import Reservation
 from r2p.protocols.rtcan.cycle import timing
 from r2p.units import MILLISECOND
-from tests.analysis.sets import compare_rtcan
 
 TIMING = timing()
 FRAME = 157_000  # ns of the longest frame
@@ -103,6 +105,28 @@ def test_control_messages_are_those_of_the_owners_and_of_the_master() -> None:
     assert alone == [17 * TIMING.slot + FRAME]  # all four messages of a second at once, beside the sync
 
 
+def test_control_is_as_urgent_as_the_discovery_that_waits_behind_it() -> None:
+    """A message of discovery that is nearly due lends its laxity to a control message of its node, which goes first."""
+    crowd = [event(f"e{number}", 4, period=50) for number in range(12)]
+    alone, *_ = bounds(event("a", 4), *crowd, *management_load({"n": 1.0}))
+    beside, *_, discovery = bounds(event("a", 4), *crowd, *management_load({"n": 1.0}, 0.5))
+    assert alone is not None
+    assert beside is not None
+    assert discovery is not None
+    assert beside - alone >= 8 * TIMING.slot  # a control message, behind one of discovery that had started
+    assert discovery <= 50 * MILLISECOND
+
+
+def test_discovery_loses_ties_for_its_last_two_milliseconds() -> None:
+    """As it is no more urgent then than with two left."""
+    before = [event(f"e{number}", 4.9, period=200) for number in range(17)]
+    tied = [event(f"t{number}", 9.5, period=200) for number in range(10)]
+    own = event("own", 5, period=200)
+    eased = msgspec.structs.replace(own, urgency=Urgency.EASED)
+    assert bounds(own, *before, *tied)[0] == 19 * TIMING.slot + FRAME  # its own, and the sync
+    assert bounds(eased, *before, *tied)[0] == 29 * TIMING.slot + FRAME
+
+
 def test_the_breakdown_is_by_how_much_more_often_events_may_come() -> None:
     events = [event(f"e{number}", 10, period=10) for number in range(5)]
     found = event_breakdown(events, [], slot_supply(TIMING))
@@ -112,9 +136,9 @@ def test_the_breakdown_is_by_how_much_more_often_events_may_come() -> None:
 
 
 @settings(max_examples=3, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(st.integers(0, 1 << 32), st.sampled_from([0.3, 0.6]))
-def test_no_response_of_a_real_network_is_longer_than_its_bound(seed: int, load: float) -> None:
-    compared = compare_rtcan(random.Random(seed), load=load, duration=60 * MILLISECOND)
+@given(st.integers(0, 1 << 32), st.sampled_from([0.3, 0.6]), st.sampled_from([0, 2, 20]))
+def test_no_response_of_a_real_network_is_longer_than_its_bound(seed: int, load: float, discovery: int) -> None:
+    compared = compare_rtcan(random.Random(seed), load=load, duration=60 * MILLISECOND, discovery=discovery)
     assert compared
     for each in compared:
         assert each.bound is None or each.slowest <= each.bound

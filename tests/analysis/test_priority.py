@@ -8,6 +8,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.analysis.sets import compare_plain
+from benchmarks.analysis.simulated import Arrival, plain_responses
 from r2p.analysis import (
     BusMessage,
     FaultModel,
@@ -22,8 +24,6 @@ from r2p.analysis.tables import read_csv
 from r2p.codecs.can_bits import INTERMISSION, OtherFrame, other_frame_bits
 from r2p.errors import MessageError
 from r2p.units import MILLISECOND
-from tests.analysis.sets import compare_plain
-from tests.analysis.simulated import Arrival, plain_responses
 
 SETS = Path(__file__).parents[1] / "golden" / "sets"
 SAE_125K = [1.416, 2.016, 2.536, 3.136, 3.656, 4.256, 5.016, 8.376, 8.976, 9.576, 10.096]

@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from can.broadcastmanager import CyclicSendTaskABC
     from can.typechecking import AutoDetectedConfig, CanFilters
 
+_NO_FD: Final = (
+    "simulated buses are CAN 2.0, without CAN FD: open it without fd=True, or take python-can's interface virtual, "
+    "which has CAN FD but no timing"
+)
 _STATES: Final = {
     ControllerState.ACTIVE: can.BusState.ACTIVE,
     ControllerState.PASSIVE: can.BusState.PASSIVE,
@@ -94,7 +98,7 @@ class R2pSimBus(can.BusABC):
             known = ", ".join(list(inspect.signature(R2pSimBus).parameters)[:-1])
             raise TypeError(f"the interface r2psim has no option {', '.join(unknown)}; it has {known}")
         if fd:
-            raise can.CanInitializationError("simulated buses are CAN 2.0, without CAN FD: open it without fd=True")
+            raise can.CanInitializationError(_NO_FD)
         self.channel = str(channel)
         if not isinstance(channel, str | int) or not self.channel or self.channel != self.channel.strip():
             raise ValueError(f'a channel is the name of a bus, such as "lab", not {channel!r}')

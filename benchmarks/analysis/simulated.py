@@ -3,13 +3,14 @@
 import asyncio
 import random
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
 
 from r2p.analysis import BusMessage, MessageClass
-from r2p.codecs import rtcan
+from r2p.codecs import management, rtcan
 from r2p.codecs.can_bits import AnyFrame, Frame, OtherFrame
 from r2p.protocols.rtcan.calendar import Reservation
 from r2p.protocols.rtcan.cycle import Timing
@@ -125,6 +126,10 @@ class RtcanNode:
         else:
             self.driver.carry_out(self.engine.publish(now, high, payload, deadline=now + deadline, drop=False))
 
+    def discover(self, payload: bytes) -> None:
+        """Send a message of discovery."""
+        self.driver.carry_out(self.engine.manage(self.driver.now(), payload))
+
     def act(self, action: Action) -> None:
         if isinstance(action, Due):
             self.driver.carry_out(self.engine.fill(self.driver.now(), action.high, bytes(self._sizes[action.high])))
@@ -170,9 +175,16 @@ class _Watcher:
 
 
 def rtcan_responses(
-    messages: Sequence[BusMessage], timing: Timing, plan: dict[str, list[Arrival]], duration: int
+    messages: Sequence[BusMessage],
+    timing: Timing,
+    plan: dict[str, list[Arrival]],
+    duration: int,
+    discovery: Mapping[str, Sequence[int]] = MappingProxyType({}),
 ) -> RtcanRun:
-    """Run a network in which each node of the messages is one; the plan counts from when it has settled."""
+    """Run a network in which each node of the messages is one; the plan counts from when it has settled.
+
+    `discovery`: when nodes send messages of discovery, by name (ns).
+    """
 
     async def main() -> RtcanRun:
         asyncio.get_running_loop().set_exception_handler(_stop)
@@ -196,6 +208,10 @@ def rtcan_responses(
                 for arrival in plan.get(each.name, ()):
                     publish = _publishing(nodes[each.node], highs[each.name], each, watcher.waiting[ids[each.name]])
                     shared.bus.timeline.at(SETTLED + arrival.queued, publish, SETTLED + arrival.queued)
+            for name, instants in discovery.items():
+                for number, instant in enumerate(instants):
+                    payload = number.to_bytes(4, "big") * (management.SIZE // 4)
+                    shared.bus.timeline.at(SETTLED + instant, nodes[name].discover, payload)
             await asyncio.sleep(duration / SECOND)
             for task in running:
                 task.cancel()

@@ -4,6 +4,7 @@ import random
 
 import msgspec
 
+from benchmarks.analysis.simulated import arrivals, plain_responses, rtcan_responses
 from r2p.analysis import (
     BusMessage,
     EventModel,
@@ -18,7 +19,6 @@ from r2p.analysis import (
 )
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.units import MILLISECOND
-from tests.analysis.simulated import arrivals, plain_responses, rtcan_responses
 
 _PERIODS = (2, 3, 5, 7, 10, 16, 20)  # ms
 _DEADLINES = (2, 3, 5, 10, 20, 35, 50, 70)  # ms
@@ -113,8 +113,11 @@ def rtcan_set(numbers: random.Random, load: float) -> RtcanSet:
     return RtcanSet(grid, messages)
 
 
-def compare_rtcan(numbers: random.Random, *, load: float, duration: int) -> list[Compared]:
-    """Simulate a network of real engines; events arrive together, or in bursts, and non real-time messages beside."""
+def compare_rtcan(numbers: random.Random, *, load: float, duration: int, discovery: int = 0) -> list[Compared]:
+    """Simulate a network of real engines; events arrive together, or in bursts, and non real-time messages beside.
+
+    `discovery`: messages that each node sends as well, at any time or all at once.
+    """
     network = rtcan_set(numbers, load)
     events = [each for each in network.messages if each.message_class is MessageClass.SRT]
     spread = numbers.choice((0, 0, MILLISECOND, 20 * MILLISECOND))
@@ -122,12 +125,14 @@ def compare_rtcan(numbers: random.Random, *, load: float, duration: int) -> list
     plan = {each.name: arrivals(each, numbers, duration, offset=start + numbers.randint(0, spread)) for each in events}
     idle = BusMessage(name="background", node="n3", size=30, period=2 * MILLISECOND, message_class=MessageClass.NRT)
     plan[idle.name] = arrivals(idle, numbers, duration // 4, offset=start)
-    run = rtcan_responses([*network.messages, idle], network.timing, plan, duration + 400 * MILLISECOND)
     nodes = sorted({each.node for each in [*network.messages, idle]})
+    width = numbers.choice((0, duration)) if discovery else 0
+    found = {node: [start + numbers.randint(0, width) for _ in range(discovery)] for node in nodes}
+    run = rtcan_responses([*network.messages, idle], network.timing, plan, duration + 400 * MILLISECOND, found)
     supply = slot_supply(network.timing, run.reservations)
     # NRT messages without a period: nobody says how many there are.
     owners = {each.node for each in network.messages if each.message_class is MessageClass.HRT}
-    management = management_load(control_rates(nodes, owners, run.master))
+    management = management_load(control_rates(nodes, owners, run.master), discovery)
     known = [*events, *management, msgspec.structs.replace(idle, period=None)]
     bounds = event_bounds(known, supply, EventModel())
     return [_compared(each, run.responses[each.message.name]) for each in bounds if each.message in events]

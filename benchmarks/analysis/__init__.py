@@ -1,0 +1,1 @@
+"""The bounds of `r2p.analysis` beside what the simulated bus does: `python -m benchmarks.analysis`."""

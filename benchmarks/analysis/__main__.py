@@ -1,0 +1,3 @@
+from benchmarks.analysis.tightness import main
+
+main()
