@@ -179,6 +179,8 @@ def _yaml(text: str) -> Any:
     except (yaml.YAMLError, UnicodeError) as error:
         if (plain := _json(text)) is not None:
             return plain
+        if "nesting depth" in str(error):  # newer libyaml looks ahead, and has a limit of its own
+            raise _too_deep(text) from error
         raise MessageError(f"{_excerpt(text)} is not valid {_problem(text, error)}") from error
 
 
