@@ -29,7 +29,9 @@ from r2p.transports.stats import RETRY_AFTER_ERROR
 
 _MEASURE_INTERVAL = 100_000_000  # ns between two measurements of UTC: clocks 100 ppm apart drift by 10 us meanwhile
 _MEASUREMENTS = 32  # that count: those of the last 3 s
-_UTC_ERROR_MIN = 1_000  # ns: two clocks are never read at the same instant
+_READING = 10_000  # ns by which network time may be off here: interrupts by 3 us at either end, and drift in a cycle
+_BIAS = 2_000  # ns of that which more measurements do not average out: clocks 200 ppm apart, always late in a cycle
+_RATE_MAX = 2e-4  # by which UTC and the master's clock differ, while there is only one measurement
 
 
 class DriverOwner(Protocol):
@@ -206,34 +208,36 @@ class UtcEstimator:
     """Estimates the offset of UTC, by the module's clock, from the network's time.
 
     Each measurement is off by an unknown delay, and the two clocks drift: so the estimate is a line through the last
-    measurements, half an interval ahead, and what they are off it is its possible error.
+    measurements, half an interval ahead. Its possible error is what a line through so few measurements can be off, or
+    what they are off it. Another master has another drift, so with it a new line begins.
     """
 
     def __init__(self, driver: EngineDriver) -> None:
         self._driver = driver
         self._measured: deque[tuple[int, int]] = deque(maxlen=_MEASUREMENTS)  # network time, offset
         self._measured_at = -_MEASURE_INTERVAL
+        self._master: tuple[int | None, int | None] = None, None  # epoch, and id8
         self._offset: ClockOffset | None = None
 
     def offset(self, now: int) -> ClockOffset | None:
         """Return the estimate at this instant of the engine's clock (ns); None without network time."""
-        if now - self._measured_at >= _MEASURE_INTERVAL:
+        master = self._driver.engine.network.epoch, self._driver.engine.network.master
+        if now - self._measured_at >= _MEASURE_INTERVAL or master != self._master:
             self._measured_at = now
-            self._measure()
+            self._measure(master)
         return self._offset
 
-    def _measure(self) -> None:
-        engine = self._driver.engine
-        network_time, epoch = engine.network_time(self._driver.now()), engine.network.epoch
-        if network_time is None or epoch is None:
+    def _measure(self, master: tuple[int | None, int | None]) -> None:
+        epoch, network_time = master[0], self._driver.engine.network_time(self._driver.now())
+        if master != self._master or network_time is None:
+            self._master = master
             self._measured.clear()
+        if network_time is None or epoch is None:
             self._offset = None
             return
-        if self._offset is not None and self._offset.epoch != epoch:
-            self._measured.clear()  # another run of the network: its time starts anew
         self._measured.append((network_time, self._driver.clock.now() - network_time))
         offset, error = _extrapolate(self._measured, network_time + _MEASURE_INTERVAL // 2)
-        self._offset = ClockOffset(epoch, offset, max(error, _UTC_ERROR_MIN))
+        self._offset = ClockOffset(epoch, offset, error)
 
 
 def _extrapolate(measured: Sequence[tuple[int, int]], time: int) -> tuple[int, int]:
@@ -242,7 +246,12 @@ def _extrapolate(measured: Sequence[tuple[int, int]], time: int) -> tuple[int, i
     points = [(each - at, offset - first) for each, offset in measured]  # small numbers, which floats have exactly
     middle, mean = (sum(values) / len(points) for values in zip(*points, strict=True))
     spread = sum((each - middle) ** 2 for each, _ in points)
-    slope = sum((each - middle) * (offset - mean) for each, offset in points) / spread if spread else 0.0
+    if not spread:
+        return first, math.ceil(_READING + _BIAS + _RATE_MAX * _MEASURE_INTERVAL)
+    slope = sum((each - middle) * (offset - mean) for each, offset in points) / spread
     widest = max(abs(offset - mean - slope * (each - middle)) for each, offset in points)
-    error = widest + abs(slope) * _MEASURE_INTERVAL / 2
-    return first + round(mean + slope * (time - at - middle)), math.ceil(error)
+    ahead = time - at - middle
+    # Independent errors add up as their squares do.
+    uncertain = _BIAS + _READING * math.sqrt(1 / len(points) + ahead**2 / spread)
+    error = max(widest, uncertain) + abs(slope) * _MEASURE_INTERVAL / 2
+    return first + round(mean + slope * ahead), math.ceil(error)
