@@ -123,5 +123,6 @@ async def test_a_topic_shows_its_fields_and_plots_them(browser: Browser, dash: D
         await tab.page.click("[aria-label='Plot odometry.pose.x']")
         await tab.until("location.hash === '#/plots/odometry.pose.x' && r2p.stats.points > 0")
         await tab.page.go_back()
+        await tab.until("document.querySelector('.detail')?.hidden === false")
         await tab.page.keyboard.press("Escape")
         await tab.until("location.hash === '#/overview' && document.querySelector('.detail').hidden")
