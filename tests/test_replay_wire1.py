@@ -42,7 +42,7 @@ async def test_they_understand_each_other_and_say_that_their_versions_differ(cap
         assert not module.links[0].losses
         assert (await anext(event async for event in events if isinstance(event, ModuleGone))).info.wire == 1
     (warning,) = [text for text in caplog.messages if "wire version" in text]
-    assert "module OLD has wire version 1 (r2p 0.1.0), this one 2" in warning
+    assert "module OLD has wire version 1 (r2p 0.1.0), this one 3" in warning
 
 
 @pytest.mark.virtual_time

@@ -241,7 +241,7 @@ async def test_a_link_with_modules() -> None:
         asyncio.get_running_loop().call_later(0.1, session.module.links[0].manage, newer, 9)
         assert await findings_of_link(session) == [
             ("connects", True, "after 0.0 s"),
-            ("module", True, f"BOT: r2p {r2p.__version__}, running, wire version 2"),
+            ("module", True, f"BOT: r2p {r2p.__version__}, running, wire version 3"),
             ("module", False, "NEW: r2p 9.9, stopped, wire version 9"),
             ("losses", True, "none"),
         ]

@@ -115,7 +115,7 @@ async def test_versions_are_listed_also_behind_a_gateway(
         await asyncio.sleep(5)
         await list_(session)
         rows = {row["module"]: (row["version"], row["wire"]) for row in printed(capsys)}
-        assert rows == {"ARM": (r2p.__version__, 2), "GW": (r2p.__version__, 2), "NEW": ("9.9", 9)}
+        assert rows == {"ARM": (r2p.__version__, 3), "GW": (r2p.__version__, 3), "NEW": ("9.9", 9)}
         monkeypatch.setattr("sys.stdout.isatty", lambda: True)
         await list_(session)
         assert re.search(r"NEW +running +False +r2p +9.9 +9, not 2 ", capsys.readouterr().out)

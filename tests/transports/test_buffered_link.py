@@ -97,7 +97,7 @@ async def test_nothing_is_kept_of_topics_that_were_closed() -> None:
             assert await leds.fetch(1.0) == led(number)
             publisher.close()
             leds.close()
-        await asyncio.sleep(5.0)
+        await asyncio.sleep(70.0)  # the longest lease, for which timers stay
         for module in (a, b):
             table = {"discovery.topics", "discovery._directory.topics"}  # one, which has a limit of its own
             assert grown(module, 50) == table

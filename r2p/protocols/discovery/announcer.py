@@ -31,6 +31,8 @@ Relayed = management.Hello | management.Alive | management.Endpoint
 _KindName = tuple[int, str]
 """KIND_TOPIC or KIND_NODE, and a name."""
 
+_HELLO_EACH = 3
+"""Presences in a crowd of which one has a HELLO: ALIVE extends the lease as well."""
 _KIND_OF_ROLE = {ROLE_PUBLISHES: ItemKind.PUBLISHER, ROLE_SUBSCRIBES: ItemKind.SUBSCRIBER}
 
 
@@ -87,6 +89,9 @@ class Announcer:
         """Topics whose names are announced, also while the link does not carry them as another one has the alias."""
         self._long_names: Counter[_KindName] = Counter()
         """Names that travel as aliases, and how many announcements have each."""
+        schedule.is_settled = self._is_settled
+        self._hello_in = 0
+        """Presences until the next HELLO in a crowd."""
 
     # The module's topics
 
@@ -141,8 +146,20 @@ class Announcer:
         if topic in self.topics[ROLE_PUBLISHES]:
             self._add(ItemKind.PUBLISHER, topic)
 
+    def await_response(self, topic: str) -> None:
+        """Repeat the request for a topic until it has been answered."""
+        self._schedule.quicken(Item(ItemKind.SUBSCRIBER, (topic,)))
+
+    def _is_settled(self, item: Item) -> bool:
+        """Return whether a topic needs no answer: a subscriber without a known publisher has none to come."""
+        if item.kind is not ItemKind.SUBSCRIBER or item.key[0] in self.publisher_counts:
+            return True
+        info = self._directory.topics.get(str(item.key[0]))
+        return info is None or info.advertised_at is None
+
     def repeat_all(self, now: int, *, tool: bool) -> None:
         """Repeat everything soon, as a module on the link is new, or asks for it; `tool`: it shows all to a user."""
+        self._hello_in = 0
         self._schedule.repeat(now, self._directory.r2p_modules, tool=tool)
 
     def relay(self, message: Relayed) -> None:
@@ -164,6 +181,7 @@ class Announcer:
 
     def update_r2p(self) -> None:
         """Begin or end the announcement of endpoints, which only r2p modules understand."""
+        self._schedule.set_crowd(self._directory.crowd)
         r2p = self._directory.r2p_modules > 0
         if self.r2p == r2p:
             return
@@ -289,9 +307,18 @@ class Announcer:
         return [] if own.type.varies else messages  # gateways of firmware would make buffers for messages of one size
 
     def _presence(self, flags: int) -> list[management.Management]:
-        hello = self.hello(flags)  # first: after an ALIVE alone the module would be taken for firmware
+        # First the HELLO: after an ALIVE alone the module would be taken for firmware.
+        hello = [] if self._is_known() and not flags else [self.hello(flags)]
         alive = [] if self._observer else [management.Alive(self.module, self.flags)]
-        return [*management.alias_messages(self.module), hello, *alive]
+        return [*management.alias_messages(self.module), *hello, *alive]
+
+    def _is_known(self) -> bool:
+        """Return whether an ALIVE is enough this time: in a crowd, which would take it for firmware if it were new."""
+        if self._observer or not self._directory.crowd or self._hello_in <= 0:
+            self._hello_in = _HELLO_EACH - 1
+            return False
+        self._hello_in -= 1
+        return True
 
     # The schedule
 

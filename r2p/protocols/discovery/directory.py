@@ -15,7 +15,7 @@ import msgspec
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, TopicType
-from r2p.protocols.discovery.schedule import SLOW_ROUNDS
+from r2p.protocols.discovery.schedule import CROWD, CROWD_ROUNDS, SLOW_ROUNDS
 from r2p.protocols.timers import KeyedTimers
 from r2p.units import MILLISECOND, SECOND
 
@@ -119,11 +119,17 @@ class Directory:
         self._names: dict[int, str] = {}
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
         self._starts: dict[str, _Starts] = {}
+        self._others = 0  # modules on the link itself that do not know crowds: firmware, or r2p of before
 
     @property
     def r2p_modules(self) -> int:
         """The number of r2p modules known on the link."""
         return len(self._names)
+
+    @property
+    def crowd(self) -> int:
+        """The number of r2p modules, if they are many and all on the link know crowds; else 0."""
+        return len(self._names) if len(self._names) >= CROWD and not self._others else 0
 
     def sole_peer(self) -> int | None:
         """The instance of the only r2p module on the link itself, not behind a gateway; None unless there is one."""
@@ -134,7 +140,7 @@ class Directory:
         return self._names.get(instance, "")
 
     def lease_of(self, source: PeerAddress) -> int | None:
-        """Return the longest lease of the r2p modules directly at an address; None without any, or if it never ends."""
+        """Return the longest lease of topics of modules at an address; None without any, or if it never ends."""
         lease = max(self._leases.get(source, ()), default=FOR_EVER)
         return lease if lease < FOR_EVER else None
 
@@ -262,7 +268,8 @@ class Directory:
         if known is None:  # the HELLO of its module may never come
             self.timers.set(("endpoint", key), now + LEASE)
         elif known.lease < FOR_EVER:
-            self.timers.set(("endpoint", key), now + SLOW_ROUNDS * known.lease)
+            rounds = CROWD_ROUNDS if known.knows_crowds else SLOW_ROUNDS
+            self.timers.set(("endpoint", key), now + rounds * known.lease)
         else:
             self.timers.clear(("endpoint", key))
 
@@ -303,19 +310,21 @@ class Directory:
     def _enter_direct(self, info: ModuleInfo) -> None:
         if info.hops == 0:
             self._direct.setdefault(info.source, {})[info.name] = info
+            self._others += not info.knows_crowds
             if info.r2p:
-                self._leases.setdefault(info.source, Counter())[info.lease] += 1
+                self._leases.setdefault(info.source, Counter())[topic_lease(info)] += 1
 
     def _forget_direct(self, info: ModuleInfo | None) -> None:
         if info is None or info.hops:
             return
         there = self._direct[info.source]
         del there[info.name]
+        self._others -= not info.knows_crowds
         if not there:
             del self._direct[info.source]
         if info.r2p:
             leases = self._leases[info.source]
-            if decrement(leases, info.lease) and not leases:
+            if decrement(leases, topic_lease(info)) and not leases:
                 del self._leases[info.source]
 
     def _forget(self, info: ModuleInfo) -> None:
@@ -327,6 +336,11 @@ class Directory:
         self._names.pop(instance, None)
         for key in list(self._endpoints_of.get(instance, ())):
             self.forget_endpoint(key)
+
+
+def topic_lease(info: ModuleInfo) -> int:
+    """Return how long a topic is kept that its r2p module does not repeat (ns); it ends with the module, anyway."""
+    return min(info.lease * CROWD_ROUNDS, FOR_EVER - 1) if info.knows_crowds and info.lease < FOR_EVER else info.lease
 
 
 def counterpart(role: int) -> int:

@@ -104,6 +104,11 @@ class ModuleInfo(msgspec.Struct, frozen=True):
     def r2p(self) -> bool:
         return self.instance is not None
 
+    @property
+    def knows_crowds(self) -> bool:
+        """Whether it may repeat its topics slowly, and keeps those of others that do."""
+        return self.r2p and self.wire >= management.WIRE_CROWD
+
     def differs(self, other: "ModuleInfo") -> bool:
         """Return whether anything but the time of the last message differs."""
         return msgspec.structs.replace(other, last_heard=self.last_heard) != self

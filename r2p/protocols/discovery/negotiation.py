@@ -17,7 +17,7 @@ import msgspec
 from r2p.codecs import management
 from r2p.codecs.management import ANSWERED, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic
-from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory, counterpart, decrement
+from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory, counterpart, decrement, topic_lease
 from r2p.protocols.discovery.events import (
     Mismatched,
     ModuleInfo,
@@ -77,7 +77,7 @@ class Peer(msgspec.Struct, eq=False):
 
     def add_module(self, now: int, info: ModuleInfo) -> None:
         """Enter an r2p module that said HELLO from this address."""
-        lease = None if info.lease >= FOR_EVER else info.lease
+        lease = None if info.lease >= FOR_EVER else topic_lease(info)
         shared = len(self.direct) > (info.name in self.direct)
         if shared and lease is not None:  # the longest lease counts, and that only ends with them all
             lease = max(lease, self.lease) if self.lease is not None else None
@@ -205,6 +205,7 @@ class SubscriptionNegotiation:
         ]
         if sizes:
             self._outbox.send(*self._own.requests(topic, own, sizes[-1]))
+            self._own.await_response(topic)
 
     def _send_response(
         self, now: int, topic: str, own: LocalTopic, requests: list[tuple[Peer, management.SubscribeRequest]]
@@ -265,9 +266,16 @@ class SubscriptionNegotiation:
                 self._remove_subscriber(peer, topic)
         if is_new and peer.r2p_until:  # the first HELLO of all may just be later than its module's requests
             peer.mark_restarted()
+            self._end_unless_repeated(now, peer)
         peer.add_module(now, info)
         for topic in list(peer.permanent):
             self._renew(now, peer, topic)
+
+    def _end_unless_repeated(self, now: int, peer: Peer) -> None:
+        """End the subscriptions of a module that has restarted, unless it still wants them."""
+        for topic in peer.subscriptions:
+            if topic not in peer.permanent and peer.lease is not None:
+                self._timers.set(("lease", peer.source, topic), now + LEASE)
 
     def restarted(self, source: PeerAddress) -> None:
         """Note that a module at an address has restarted without its subscriptions: its next requests count as new."""

@@ -3,15 +3,20 @@
 New items go first (`_fresh`), after a presence that is overdue, then join the ring. A request for everything only
 raises the number of steps that don't wait (`_eager`) to one full turn, so that fifty requests at once cost one turn.
 Items that only describe, endpoints and names, leave the ring after two turns for one that turns more slowly (`_slow`),
-until a module is new.
+until a module is new. Where many modules of r2p are on a link (`set_crowd`), topics do so, too, unless they wait for an
+answer, and the more modules there are, the more slowly the slow ring turns: what all say together stays the same.
 """
 
 from collections import OrderedDict
 from enum import Enum, auto
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from r2p.units import SECOND
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 _STEP = SECOND // 2
 """Ns between two steps, at most, when there is little to repeat."""
@@ -19,6 +24,13 @@ _ROUND = 3 * SECOND // 2
 """Ns in which the ring turns once, if the rate allows. The shortest lease is three turns, so two may be lost."""
 SLOW_ROUNDS = 4
 """Turns of the ring in which the slow ring turns once."""
+CROWD = 5
+"""Other modules on the link from which on topics are repeated in the slow ring, if all of them know that."""
+CROWD_ROUNDS = 14
+"""The most turns of the ring in which the slow ring turns once, reached with as many modules."""
+_PRESENCE_MODULES = 30
+_PRESENCE_MAX = 10
+"""For each so many modules, presences are a round apart, up to so many rounds."""
 _PRESENCE_INTERVAL = SECOND // 10
 """Ns between two presences (HELLO and ALIVE), at least, however many modules ask."""
 _PRESENCE_EACH = SECOND // 100
@@ -107,6 +119,10 @@ class Schedule:
         self._tool_waits = False
         self._traffic_at = -SECOND
         self._held = -SECOND
+        self._crowd = 0
+        self._rounds = SLOW_ROUNDS
+        self.is_settled: Callable[[Item], bool] = lambda item: True
+        """Whether a topic waits for no answer; called for those of a crowd."""
 
     def hold(self, until: int) -> None:
         """Let nothing go before this instant (ns)."""
@@ -116,6 +132,22 @@ class Schedule:
         """Change the rate, the burst and the quiet time (ns)."""
         self._bucket = self._bucket.changed(rate, max(burst, _ITEM_MESSAGES))
         self._quiet = quiet
+
+    def set_crowd(self, modules: int) -> None:
+        """Repeat topics slowly, as so many modules of r2p are on the link; 0: as usual."""
+        if modules and not self._crowd:
+            self._lap = max(self._lap, 1)  # from the next step on
+        elif self._crowd and not modules:
+            self._include_slow()
+        self._crowd = modules
+        self._rounds = min(max(SLOW_ROUNDS, modules), CROWD_ROUNDS) if modules else SLOW_ROUNDS
+
+    def quicken(self, item: Item) -> None:
+        """Repeat an item in the fast ring, if it is in the slow one, until it is settled."""
+        if item in self._slow:
+            del self._slow[item]
+            self._ring[item] = None
+            self._lap = max(self._lap, 2 * len(self._ring))
 
     def add(self, item: Item) -> None:
         """Announce an item as soon as the rate allows, and unless `once` for ever. A waiting one keeps its turn."""
@@ -195,8 +227,11 @@ class Schedule:
             self._relay_next = False
             return self._relayed.popitem(last=False)[0]
         self._relay_next = True
-        self._step_at = now + self._interval
-        if self._presence_at <= now or not (self._ring or self._slow):
+        presence = self._presence_at <= now or not (self._ring or self._slow)
+        # In a crowd steps are rarer than presences, which must not put them off.
+        if not (presence and self._crowd and (self._ring or self._slow)):
+            self._step_at = now + self._interval
+        if presence:
             self._presence_sent, self._presence_at = now, now + self._presence_period
             return Item(ItemKind.PRESENCE, once=True)
         return self._repetition()
@@ -208,6 +243,8 @@ class Schedule:
     @property
     def round_time(self) -> int:
         """Ns to repeat everything."""
+        if self._crowd:
+            return max(self._presence_period, _ITEM_MESSAGES * self._bucket.gap * (self._places + 1))
         slot = max(self._interval, _ITEM_MESSAGES * self._bucket.gap, self._quiet)
         return max(_ROUND, (self._places + 1) * slot)
 
@@ -219,15 +256,21 @@ class Schedule:
     @property
     def _places(self) -> int:
         """Steps in one turn of the ring: each of its items, and a share of the slow ones."""
-        return self._count - len(self._slow) * (SLOW_ROUNDS - 1) // SLOW_ROUNDS
+        return self._count - len(self._slow) * (self._rounds - 1) // self._rounds
 
     @property
     def _interval(self) -> int:
-        return min(_STEP, _ROUND // (self._places + 1))
+        if not self._crowd:
+            return min(_STEP, _ROUND // (self._places + 1))
+        share = self._rounds * (self._count - len(self._slow)) + len(self._slow)
+        return _ROUND * self._rounds // max(1, share)
 
     @property
     def _presence_period(self) -> int:
-        return max(min(_ROUND, _STEP * (self._places + 1)), _PRESENCE_SHARE * self._bucket.gap)
+        period = min(_ROUND, _STEP * (self._places + 1))
+        if self._crowd:
+            period = _ROUND * min(max(1, self._crowd // _PRESENCE_MODULES), _PRESENCE_MAX)
+        return max(period, _PRESENCE_SHARE * self._bucket.gap)
 
     def _repeat(self, now: int) -> None:
         self._repeated_at, self._repeat_at, self._tool_waits = now, None, False
@@ -248,9 +291,9 @@ class Schedule:
         self._lap = max(self._lap, self._count)
 
     def _repetition(self) -> Item:
-        """The next item of the ring, or of the slow ring so often that it turns once in `SLOW_ROUNDS`."""
+        """The next item of the ring, or of the slow ring so often that it turns once in `_rounds`."""
         ring, slow = self._ring, self._slow
-        share = SLOW_ROUNDS * len(ring) + len(slow)
+        share = self._rounds * len(ring) + len(slow)
         self._owed += len(slow)  # of `share` steps, len(slow) go to the slow ring
         if slow and self._owed >= share:
             self._owed %= share
@@ -263,10 +306,13 @@ class Schedule:
         return item
 
     def _slow_down(self) -> None:
-        """Move endpoints and names to the slow ring, once everything was announced twice."""
-        for item in [item for item in self._ring if item.kind in _DESCRIBING]:
+        """Move endpoints and names to the slow ring, once everything was announced twice; in a crowd also topics."""
+        slow = [item for item in self._ring if item.kind in _DESCRIBING or (self._crowd and self.is_settled(item))]
+        for item in slow:
             del self._ring[item]
             self._slow[item] = None
+        if self._crowd:
+            self._lap = len(self._ring)  # then those that wait for an answer are looked at once more
 
     def _turn_at(self) -> int:
         self._eager = min(self._eager, self._count)

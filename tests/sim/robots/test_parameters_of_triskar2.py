@@ -91,6 +91,7 @@ async def test_a_gain_that_is_tuned_while_it_drives_changes_its_step_response() 
         before = await driver.step(0.4)
         steady = []
         for kp in (0.5, 5.0):
+            await asyncio.sleep(0.5)  # the step before has settled
             for motor in MOTORS:
                 await pc.network.set_parameters(motor, {("motor", "kp"): kp})
             for _ in range(100):

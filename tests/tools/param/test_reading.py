@@ -79,7 +79,7 @@ async def test_list(capsys: pytest.CaptureFixture[str]) -> None:
 
 async def test_list_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((80, 24)))
+    monkeypatch.setattr("shutil.get_terminal_size", lambda *_, **__: os.terminal_size((80, 24)))
     async with robot(drive), tool() as session:
         await list_(session)
     assert capsys.readouterr().out.splitlines() == [

@@ -82,7 +82,7 @@ async def test_figures_of_a_drive() -> None:
     assert body.odometry.off <= body.off_max < 0.02
     assert figures.bus is not None
     assert 0.05 < figures.bus.load < 0.5
-    assert figures.bus.frames == pytest.approx(3 * figures.bus.rate, rel=0.2)
+    assert figures.bus.frames == pytest.approx(3 * figures.bus.rate, rel=0.3)  # at first more is announced
     assert figures.bus.mean == pytest.approx(figures.bus.load, rel=0.2)
     assert figures.bus.of == 60
     assert 2.0 < figures.bus.slots < 4.0  # five messages each 20 ms, in cycles of 10 ms

@@ -1,0 +1,173 @@
+"""Many modules on one link: what they repeat, by count; and that losses and modules of before stay harmless."""
+
+import math
+import random
+from collections import Counter
+
+import pytest
+
+from r2p.codecs import management as m
+from r2p.protocols.discovery.directory import LEASE
+from r2p.protocols.discovery.events import (
+    Event,
+    PublisherFound,
+    PublisherGone,
+    Send,
+    SubscriberJoined,
+    SubscribersGone,
+)
+from r2p.protocols.discovery.session import Discovery
+from tests.protocols.discovery.wire import MS, S, hear, run, sent
+
+
+class Crowd:
+    """Discoveries on one link without delay. Each publishes so many topics, and subscribes to the first of the next."""
+
+    def __init__(self, modules: int, *, topics: int = 3, loss: float = 0.0) -> None:
+        self.now = 0
+        self.heard: Counter[str] = Counter()
+        """Messages, by the number of modules that handled them."""
+        self.said: Counter[type] = Counter()
+        self.attached = [set[str]() for _ in range(modules)]
+        self.opened = [set[str]() for _ in range(modules)]
+        self.modules = [Discovery(f"M{n}", n + 1) for n in range(modules)]
+        self._loss = loss
+        self._random = random.Random(modules)
+        for n, module in enumerate(self.modules):
+            for topic in range(topics):
+                module.advertise(0, f"m{n}t{topic}", 8)
+            module.subscribe(0, f"m{(n + 1) % modules}t0", 8)
+            self._act(n, module.link_up(0))
+
+    def run(self, seconds: float) -> None:
+        end = self.now + round(seconds * S)
+        while True:
+            due, n = min((each.next_deadline() or end, n) for n, each in enumerate(self.modules))
+            if due >= end:
+                break
+            self.now = max(self.now, due)
+            self._act(n, self.modules[n].poll(self.now))
+        self.now = end
+
+    def is_connected(self) -> bool:
+        count = len(self.modules)
+        return all(self.attached[n] == {f"m{n}t0"} for n in range(count)) and all(
+            self.opened[n] == {f"m{(n + 1) % count}t0"} for n in range(count)
+        )
+
+    def _act(self, n: int, events: list[Event]) -> None:
+        for event in events:
+            match event:
+                case Send(data):
+                    self.said[type(m.decode(data))] += 1
+                    for other, module in enumerate(self.modules):
+                        if other != n and self._random.random() >= self._loss:
+                            self.heard["all"] += 1
+                            self._act(other, module.receive(self.now, data, n))
+                case SubscriberJoined(topic):
+                    self.attached[n].add(topic)
+                case SubscribersGone(topic):
+                    self.attached[n].discard(topic)
+                case PublisherFound(topic):
+                    self.opened[n].add(topic)
+                case PublisherGone(topic):
+                    self.opened[n].discard(topic)
+                case _:
+                    pass
+
+
+def idle_rate(modules: int) -> float:
+    """Messages a second of all modules together, when there is nothing new."""
+    crowd = Crowd(modules)
+    crowd.run(10)
+    assert crowd.is_connected()
+    crowd.said.clear()
+    crowd.run(60)
+    assert crowd.is_connected()
+    return crowd.said.total() / 60
+
+
+def test_what_is_said_grows_with_those_who_talk() -> None:
+    few, many = idle_rate(6), idle_rate(24)
+    assert math.log(many / few) / math.log(24 / 6) < 1.05
+    assert many / 24 < 2, "messages of one module, with HELLO and ALIVE"
+
+
+def test_a_start_costs_each_module_a_few_repetitions() -> None:
+    said = {}
+    for modules in (6, 24):
+        crowd = Crowd(modules)
+        crowd.run(6)
+        said[modules] = crowd.said.total()
+    assert math.log(said[24] / said[6]) / math.log(24 / 6) < 1.2
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.4])
+def test_losses_are_made_good(loss: float) -> None:
+    crowd = Crowd(8, loss=loss)
+    crowd.run(60)
+    assert crowd.is_connected()
+
+
+def test_a_subscription_outlasts_its_lease_while_its_module_is_there_and_no_longer() -> None:
+    crowd = Crowd(6)
+    crowd.run(40)
+    assert crowd.is_connected()
+    gone = crowd.modules.pop(5)
+    assert gone.next_deadline() is not None
+    crowd.run(LEASE / S + 0.1)
+    assert not crowd.attached[0]
+    assert not crowd.opened[4]
+
+
+def crowded(*, wire: int = m.WIRE_VERSION) -> Discovery:
+    """One that knows five others on its link, and repeats a topic."""
+    discovery = Discovery("PC1", 99)
+    discovery.advertise(0, "leds", 5)
+    discovery.link_up(0)
+    for n in range(5):
+        others = m.WIRE_VERSION if n else wire
+        hear(discovery, 0, m.Hello(f"M{n}", n + 1, lease_ms=60_000, wire=others), m.Alive(f"M{n}", 0), source=n)
+    return discovery
+
+
+def offers(discovery: Discovery, start: int, end: int) -> int:
+    return sum(isinstance(each, m.Advertise) for each in sent([event for _, event in run(discovery, start, end)]))
+
+
+def requests(discovery: Discovery, start: int, end: int) -> int:
+    said = sent([event for _, event in run(discovery, start, end)])
+    return sum(isinstance(each, m.SubscribeRequest) for each in said)
+
+
+def test_topics_are_repeated_slowly_only_if_all_know_that() -> None:
+    settled = crowded()
+    run(settled, 0, 10 * S)
+    assert 4 <= offers(settled, 10 * S, 50 * S) <= 7
+    before = crowded(wire=2)
+    run(before, 0, 10 * S)
+    assert offers(before, 10 * S, 50 * S) >= 26
+    run(settled, 50 * S, 51 * S)
+    hear(settled, 51 * S, m.Alive("FW", 0), source=20)  # firmware
+    assert offers(settled, 51 * S, 56 * S) >= 3
+
+
+def test_a_request_is_repeated_until_it_is_answered() -> None:
+    discovery = crowded()
+    discovery.subscribe(0, "pwm", 8)
+    run(discovery, 0, 2 * S)
+    assert requests(discovery, 2 * S, 12 * S) <= 2
+    hear(discovery, 12 * S, m.Advertise("pwm", 8), source=1)
+    assert requests(discovery, 12 * S, 22 * S) >= 5
+    hear(discovery, 22 * S, m.SubscribeResponse("pwm", 8, 5), source=1)
+    run(discovery, 22 * S, 26 * S)
+    assert requests(discovery, 26 * S, 36 * S) <= 2
+
+
+def test_a_restarted_module_keeps_no_subscription_that_it_does_not_want() -> None:
+    discovery = crowded()
+    joined = hear(discovery, S, m.SubscribeRequest("leds", 5, 5, m.UNANSWERED), source=1)
+    assert any(isinstance(event, SubscriberJoined) for event in joined)
+    hear(discovery, 2 * S, m.Hello("M1", 77, lease_ms=60_000, wire=m.WIRE_VERSION), source=1)
+    events = [event for _, event in run(discovery, 2 * S, 2 * S + LEASE + MS)]
+    assert SubscribersGone("leds") in events
