@@ -18,6 +18,10 @@ from r2p.protocols.can_orders import Mailbox, Transmit, Withdraw
 from r2p.protocols.rtcan.calendar import PeriodRule
 from r2p.protocols.rtcan.cycle import Cycle, timing
 from r2p.protocols.timers import KeyedTimers
+from r2p.units import LONG_AGO, SECOND
+
+_FOREIGN = 10  # syncs; of two masters that meet, the lesser one sends up to three
+_REPORT_APART = 10 * SECOND  # between two `ForeignSyncs`
 
 
 class Profile(enum.Enum):
@@ -171,6 +175,12 @@ class ParametersMatch(msgspec.Struct, frozen=True):
     """The network's parameters are this node's after all."""
 
 
+class ForeignSyncs(msgspec.Struct, frozen=True):
+    """Another node sends syncs, beside the master's or in their place: a broken one, which nothing identifies."""
+
+    reason: str
+
+
 class SyncSeen(msgspec.Struct, frozen=True):
     """The sync of cycle `counter` was received, or was sent by this node. Only while `EngineContext.report_syncs`.
 
@@ -208,12 +218,38 @@ class SlotsLost(msgspec.Struct, frozen=True):
 
 
 PortAction = Transmit | Withdraw
-NetworkEvent = Ready | IdConflict | NewMaster | LostSync | ParameterMismatch | ParametersMatch | SyncSeen
+NetworkEvent = Ready | IdConflict | NewMaster | LostSync | ParameterMismatch | ParametersMatch | ForeignSyncs | SyncSeen
 SlotEvent = SlotsGranted | SlotsRefused | SlotsLost
 Action = PortAction | Received | Done | Due | NetworkEvent | SlotEvent
 
 
 # Inside an engine
+
+
+class SyncCheck:
+    """Reports syncs of another node, from so many within a second on as two masters that meet never send."""
+
+    def __init__(self, actions: "list[Action]") -> None:
+        self._actions = actions
+        self._since = self._reported_at = LONG_AGO
+        self._foreign = 0
+
+    def on_foreign(self, now: int) -> None:
+        """Note a sync off the grid, of another count, or of another node while this one is the master."""
+        if now >= self._since + SECOND:
+            self._since, self._foreign = now, 0
+        self._foreign += 1
+        if self._foreign == _FOREIGN:
+            self._report(now, f"{_FOREIGN} within a second are not the master's")
+
+    def on_unreserved(self, now: int, syncs: int) -> None:
+        """Note that so many syncs in a row lack slots of this node, which it had."""
+        self._report(now, f"{syncs} in a row lack slots of this module, which now counts them as lost")
+
+    def _report(self, now: int, reason: str) -> None:
+        if now >= self._reported_at + _REPORT_APART:
+            self._reported_at = now
+            self._actions.append(ForeignSyncs(reason))
 
 
 class EngineContext:
@@ -227,6 +263,7 @@ class EngineContext:
         self.actions: list[Action] = []
         """Actions for the owner of the engine, in order."""
         self.counts: Counter[str] = Counter()
+        self.sync_check = SyncCheck(self.actions)
         self.report_syncs = False
         """True while the owner wants a `SyncSeen` for each sync."""
         self._draws = 0

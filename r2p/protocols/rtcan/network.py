@@ -200,7 +200,7 @@ class NetworkMembership:
     def on_sync(self, now: int, frame: Frame, stamp: int) -> None:
         """Follow the sync frame of another node; as the master, answer it."""
         if self.election.role is Role.MASTER:
-            self._counts["foreign syncs"] += 1
+            self._foreign_sync(now)
             self._answer(now)
             return
         self._transmitter.poll(now)  # first the rest of the cycle that ends now
@@ -213,7 +213,7 @@ class NetworkMembership:
                 self._transmitter.begin_cycle(now)
                 self._follow(now, self._tracker.on_aligned(now))
             case Alignment.FOREIGN:
-                self._counts["foreign syncs"] += 1
+                self._foreign_sync(now)
                 self._tracker.on_foreign()
             case Alignment.STARTED | Alignment.RESUMED:
                 self._join(now, resumed=alignment is Alignment.RESUMED)
@@ -352,6 +352,10 @@ class NetworkMembership:
             if changed:
                 self._actions.append(NewMaster(network.id8, network.epoch, own=False))
             self._requests.resume(now)
+
+    def _foreign_sync(self, now: int) -> None:
+        self._counts["foreign syncs"] += 1
+        self._context.sync_check.on_foreign(now)
 
     def _report_sync(self, frame: Frame, stamp: int) -> None:
         """Report a sync that was received, once it is known whose it is."""

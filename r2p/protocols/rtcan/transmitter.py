@@ -271,7 +271,7 @@ class SlotTransmitter:
         self._done = self._tried = 0
         self.plan.begin_cycle(self._cycle.counter)
         if self.plan.own:
-            self._check_mask(self.plan.own)
+            self._check_mask(now, self.plan.own)
         self.realign(now)
 
     def realign(self, now: int) -> None:
@@ -344,10 +344,10 @@ class SlotTransmitter:
 
     # Slots
 
-    def _check_mask(self, own: int) -> None:
+    def _check_mask(self, now: int, own: int) -> None:
         """Doubt a mask without own slots of the last ones: it is more likely forged than true.
 
-        A cycle with such a mask counts as one without a sync, of which there may be three.
+        A cycle with such a mask counts as one without a sync, of which there may be three. One more is reported.
         """
         mask = self._cycle.mask
         if mask is None:
@@ -359,6 +359,8 @@ class SlotTransmitter:
             self._counts["masks doubted"] += 1
             self._cycle.doubt()
         else:
+            if self._confirmed == _CONFIRMED:
+                self._context.sync_check.on_unreserved(now, self._doubted + 1)
             self._confirmed = 0
 
     def _schedule(self, now: int) -> None:

@@ -26,6 +26,7 @@ from r2p.protocols.rtcan.events import (
     Done,
     Due,
     EngineSettings,
+    ForeignSyncs,
     IdConflict,
     LostSync,
     NewMaster,
@@ -533,6 +534,9 @@ def describe_event(event: Action, *, fixed_id: bool) -> tuple[str, str, bool]:
             return "master", f"this module is the RTCAN master (epoch {epoch:08x})", False
         case NewMaster(id8):
             return "master", f"{'firmware' if id8 is None else f'node {id8}'} is the RTCAN master", False
+        case ForeignSyncs(reason):
+            text = f"a broken node sends sync frames, which costs slots: {reason}; unplug modules one by one to find it"
+            return "foreign syncs", text, True
         case LostSync(reason):
             return "no master", f"no RTCAN master: {reason}", True
         case ParameterMismatch(reason):

@@ -16,6 +16,7 @@ from r2p.protocols.rtcan.events import (
     EngineContext,
     EngineSettings,
     Fate,
+    ForeignSyncs,
     SlotsGranted,
     SlotsLost,
     SlotsRefused,
@@ -257,6 +258,7 @@ def test_a_forged_sync_without_our_slots_does_not_end_them(mask: int) -> None:
         owner.act(owner.engine.receive(owner.now, forged, owner.now))
         bus.run(200 * MS)
     assert owner.engine.counts["masks doubted"] == 10
+    assert owner.of(ForeignSyncs) == []
     assert owner.engine.counts["missed"] == missed
     assert len(listener.received(TOPIC)) >= len(filled) - 1
     assert len(filled) > got
@@ -272,6 +274,8 @@ def test_a_mask_that_stays_without_our_slots_is_believed() -> None:
     bus.run(20 * CYCLE)
     assert owner.engine.counts["masks doubted"] == 3
     assert owner.engine.counts["hrt not in the mask"] > 0
+    (found,) = owner.of(ForeignSyncs)
+    assert found.reason == "4 in a row lack slots of this module, which now counts them as lost"
 
 
 def test_plans_that_never_repeat_are_not_all_kept() -> None:

@@ -11,6 +11,7 @@ from r2p.protocols.rtcan.events import (
     Action,
     Done,
     Fate,
+    ForeignSyncs,
     IdConflict,
     LostSync,
     NewMaster,
@@ -259,7 +260,34 @@ def test_two_masters_that_meet_the_lesser_one_yields_at_once() -> None:
     assert len({node.engine.network.epoch for node in bus.nodes}) == 1
     lesser = [at for at, node in syncs(bus, met) if node is groups[0][0]]
     assert len(lesser) <= 3
+    assert not any(node.of(ForeignSyncs) for node in bus.nodes)
     assert len({current_cycle(node.engine) for node in bus.nodes}) == 1
+
+
+def test_syncs_of_another_node_are_reported_once_in_ten_seconds() -> None:
+    """By the master, whose own they are not, and by a slave, as they are off the grid."""
+    bus = Bus()
+    master, slave, *_ = network(bus, 1, 0, 0)
+    for _ in range(11 * 100):
+        bus.run(master.engine.cycle.end + CYCLE // 2 - bus.now)
+        forged = rtcan.encode_sync(master.engine.cycle.counter, 1)
+        for node in master, slave:
+            node.act(node.engine.receive(node.now, forged, node.now))
+    times = [[at for at, action in node.actions if isinstance(action, ForeignSyncs)] for node in (master, slave)]
+    assert [len(each) for each in times] == [2, 2]
+    assert all(second - first >= 10 * SECOND for first, second in times)
+    assert master.of(ForeignSyncs)[0].reason == "10 within a second are not the master's"
+
+
+def test_a_few_syncs_of_another_node_are_not_reported() -> None:
+    bus = Bus()
+    master, slave, *_ = network(bus, 1, 0, 0)
+    for _ in range(30):
+        bus.run(120 * MS)
+        for node in master, slave:
+            node.act(node.engine.receive(node.now, rtcan.encode_sync(0, 1), node.now))
+    assert master.engine.counts["foreign syncs"] == slave.engine.counts["foreign syncs"] == 30
+    assert not any(node.of(ForeignSyncs) for node in (master, slave))
 
 
 def test_new_slots_are_not_given_away_before_the_old_owners_have_asked() -> None:

@@ -14,9 +14,10 @@ from r2p.msg import PWM2, Led
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
 from r2p.runtime.events import ModuleEvent
-from r2p.sim.can import ControllerState
+from r2p.sim.can import CanNode, ControllerState
 from r2p.transports.rtcan.transport import RtcanOptions
-from tests.transports.rtcan.networks import GUARD, Lab, lab, until
+from r2p.units import SECOND
+from tests.transports.rtcan.networks import CYCLE, GUARD, Lab, lab, until
 
 pytestmark = pytest.mark.virtual_time
 
@@ -82,6 +83,26 @@ async def test_the_master_dies_and_another_one_takes_over() -> None:
         await publishers["ABC".index(old)].ready(5.0)
         assert wanted.subscribers
         assert not any(subscriber.queue for subscriber in subscribers.values())
+
+
+@pytest.mark.parametrize("offset", [CYCLE // 2, -140_000])
+async def test_a_node_that_sends_syncs_with_the_right_count_is_news(offset: int) -> None:
+    """In the middle of a cycle all report it. In place of the master's, without slots, the master and the owner do."""
+    async with lab("A", "B") as (made, (alice, bob)):
+        publisher = alice.advertise("pwm", PWM2, r2p.Periodic(0.005, PWM2))
+        _subscriber = bob.subscribe("pwm", PWM2, lossy=True)
+        await publisher.ready(5.0)
+        await asyncio.sleep(0.2)
+        events = {name: made.host(name).events() for name in ("A", "B")}
+        attacker = made.can.bus.attach(CanNode("X"))
+        cycle, clock = (found := made.link("B")).engine.cycle, found.driver.port.monotonic
+        start, counter = cycle.reference, cycle.counter
+        for number in range(2, 40):
+            at = clock(start + number * CYCLE) + offset
+            await asyncio.sleep((at - made.can.bus.timeline.now()) / SECOND)
+            attacker.request(rtcan.encode_sync(counter + number, 1))
+        for name in ("A", "B"):
+            assert "a broken node sends sync frames" in (await notice(events[name], "foreign syncs")).text
 
 
 async def _listen(node: r2p.Node, topic: str) -> None:
