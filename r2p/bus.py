@@ -17,6 +17,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Self
 
 from r2p.clock import SHORTEST, check_seconds, clock_of
+from r2p.codecs import PublisherClass
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import Closed, Error
 from r2p.protocols.can_orders import Mailbox, Outcome
@@ -48,6 +49,7 @@ __all__ = [
 
 QUEUE_MAX = 8192
 """Unread frames at most: a second of a saturated bus. Then the oldest are dropped and counted."""
+_PUBLISHER_CLASSES = frozenset(map(int, PublisherClass))
 
 # After a period, frames of it may still be unread. These decide when none are left.
 _CHECK_INTERVAL = 10_000_000  # ns
@@ -162,6 +164,16 @@ class BusMonitor:
     def slot_cycles(self) -> int:
         """The number of whole cycles in `slots`."""
         return self._opened_monitor().cycles
+
+    @property
+    def publishers(self) -> dict[tuple[str, str], PublisherClass]:
+        """The classes of publishers, by topic and module, that were announced since the bus was opened."""
+        directory = self._opened_monitor().directory
+        return {
+            (topic, directory.modules.get(id8, f"id {id8}")): PublisherClass(known)
+            for (id8, topic), known in directory.publishers.items()
+            if known in _PUBLISHER_CLASSES
+        }
 
     async def __aiter__(self) -> AsyncIterator[SeenFrame]:
         """Iterate over every frame from now on. Raises Closed outside of the `async with` block."""

@@ -19,6 +19,7 @@ from r2p.units import NEVER
 
 _SYNC = -1  # in place of a message id
 _OTHER = -2
+_PUBLISHERS_MAX = 4096
 _EARLY = 8  # a frame that starts less than this part of a slot early belongs to the slot
 
 
@@ -121,7 +122,7 @@ class BusLoad(msgspec.Struct, frozen=True):
 class BusDirectory:
     """Names of modules and topics, and the timing of the network, from the modules' announcements.
 
-    All tables are bounded by the 16 bits of a message id.
+    All tables are bounded, but for that of publishers by the 16 bits of a message id.
     """
 
     def __init__(self, timing: Timing) -> None:
@@ -134,6 +135,8 @@ class BusDirectory:
         """Names by message id."""
         self.sizes: dict[int, int] = {}
         """Bytes of a message, by message id."""
+        self.publishers: dict[tuple[int, str], int] = {}
+        """Classes of publishers, CLASS_..., by id8 and topic."""
         self._greeted: set[int] = set()  # id8 with a name from a HELLO: a gateway also passes ALIVE on
 
     def learn(self, data: bytes, source: int) -> str:
@@ -154,6 +157,11 @@ class BusDirectory:
             case management.SubscribeResponse(topic, size, _, params):
                 number = management.rtcan_message_id(params)
                 self.topics[number], self.sizes[number] = topic, size
+            case management.Endpoint(management.ROLE_PUBLISHES, topic=topic, publisher_class=publisher_class):
+                if len(self.publishers) < _PUBLISHERS_MAX:
+                    self.publishers[source, topic] = publisher_class & ~management.CLASS_LATCHES
+            case management.Endpoint(role, topic=topic) if role == management.ROLE_PUBLISHES + management.ROLE_GONE:
+                self.publishers.pop((source, topic), None)
             case management.Network(slots=slots, slot=slot) if 2 <= slots <= rtcan.SLOTS_MAX and slot:
                 self.timing_known = True
                 self.timing = Timing(slots, slot, self.timing.bit)

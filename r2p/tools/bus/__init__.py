@@ -1,8 +1,8 @@
 """`r2p bus`: what an RTCAN bus carries, how its slots are used, and what still fits; and a simulated bus for others.
 
 `traffic` has `load`, `dump`, and how a command opens a bus; `slots` has `schedule` and `admit`, and draws the cycle;
-`analyze` computes worst cases, of a file or of what `live` has measured. These only listen. `serve` runs a simulated
-bus.
+`analyze` computes worst cases, of a file or of a live bus: `live` has what was measured there. These only listen; with
+`reported`, `analyze` asks the modules of any network instead. `serve` runs a simulated bus.
 """
 
 from r2p.tools import session

@@ -15,16 +15,19 @@ from r2p.analysis.dbc import read_dbc, write_dbc
 from r2p.analysis.tables import MessageSet, read_csv, read_toml
 from r2p.bus import Calendar, Refusal, Timing
 from r2p.codecs import rtcan
-from r2p.tools.bus.live import watch
+from r2p.tools.bus.live import LiveBus, watch
+from r2p.tools.bus.reported import ReportedBus, collect
 from r2p.tools.bus.slots import grid
 from r2p.tools.bus.traffic import listen
-from r2p.tools.config import UsageError, settings
+from r2p.tools.config import Settings, UsageError, settings
 from r2p.tools.options import Format, Via, time_option
 from r2p.tools.output import Output, Record, notify
+from r2p.tools.session import join
 from r2p.units import MILLISECOND, SECOND
 
 _READERS = {".csv": read_csv, ".toml": read_toml, ".dbc": read_dbc}
 _BITRATE, _SLOTS = 1_000_000, 60
+_CAN = ("rtcan:", "r2psim:")
 _WATCHED = 10.0  # s
 _NAMED = 5  # late messages that the error names
 _COLUMNS = ["name", "node", "class", "id", "bytes", "period_ms", "deadline_ms", "jitter_ms", "bound_ms", "result"]
@@ -42,12 +45,13 @@ class Conditions(msgspec.Struct, frozen=True):
 
 
 class Report(msgspec.Struct):
-    """The bounds, the reasons of messages without slots, and the sums by name."""
+    """The bounds, the reasons of messages without slots, the sums by name; of a live bus, what was assumed."""
 
     bounds: list[ResponseBound]
     refused: dict[str, str]
     summary: dict[str, Any]
     chances: dict[str, float] = {}
+    assumed: list[str] = []
 
 
 _File = Annotated[
@@ -105,14 +109,15 @@ async def analyze(
 ) -> None:
     """Compute worst-case response times on a CAN bus.
 
-    Of plain CAN by the identifiers, and of RTCAN for messages with a class: hrt, srt, nrt. FILE has them, or with
-    --via they are measured on a live RTCAN bus. The exit code is 1 if a deadline may be missed.
+    Of plain CAN by the identifiers, and of RTCAN for messages with a class: hrt, srt, nrt. FILE has them; or with
+    --via rtcan:can0 they are measured on a live RTCAN bus, or on any other link asked of its modules. The exit code is
+    1 if a deadline may be missed.
 
     Also: how much longer all frames may become until then, the guard that slots need, and the shortest safe slot.
     """
     output = Output(format)
     if (file is None) == (via is None):
-        raise UsageError("give a FILE with messages, or --via rtcan:can0 for a live bus")
+        raise UsageError("give a FILE with messages, or --via for a live bus, as in --via rtcan:can0")
     found = MessageSet([]) if file is None else await asyncio.to_thread(_read, file)
     rate = bitrate or found.bitrate or _BITRATE
     conditions = Conditions(
@@ -124,7 +129,7 @@ async def analyze(
         control,
     )
     if file is None:
-        report = await _live(settings(via, tool=True), duration or _WATCHED, conditions)
+        report = await _live(settings(via, tool=True), duration or _WATCHED, conditions, dbc=dbc is not None)
     elif any(each.message_class is not MessageClass.PLAIN for each in found.messages):
         length = cycle if cycle is not None or found.cycle is None else found.cycle / SECOND
         report = planned(found.messages, grid(slots or found.slots or _SLOTS, length, rate), conditions)
@@ -154,14 +159,24 @@ def _write(file: Path, text: str) -> None:
         raise r2p.Error(f"can't write {file}: {error.strerror}") from error
 
 
-async def _live(chosen: Any, duration: float, conditions: Conditions) -> Report:
-    async with listen(chosen) as bus:
-        if not await bus.cycles(1, timeout=3.0):
-            raise r2p.Error("no sync frames: no RTCAN master on this bus, so it has no slots")
-        live = await watch(bus, duration)
-    conditions = msgspec.structs.replace(conditions, bit=live.timing.bit)
-    control = live.control if conditions.control else []
-    return slotted(live.declared, control, live.supply, conditions, {})
+async def _live(chosen: Settings, duration: float, conditions: Conditions, *, dbc: bool) -> Report:
+    """Return the report of a bus that carries messages now: listen to it, or ask its network."""
+    found: LiveBus | ReportedBus
+    if not chosen.via or any(url.startswith(_CAN) for url in chosen.via):
+        async with listen(chosen) as bus:
+            if not await bus.cycles(1, timeout=3.0):
+                raise r2p.Error("no sync frames: no RTCAN master on this bus, so it has no slots")
+            found = await watch(bus, duration)
+    else:
+        if dbc:
+            raise UsageError("--dbc needs the identifiers of the frames: give --via rtcan:can0, or a FILE")
+        async with join(chosen) as session:
+            found = await collect(session, duration, conditions.bit)
+    conditions = msgspec.structs.replace(conditions, bit=found.timing.bit)
+    control = found.control if conditions.control else []
+    report = slotted(found.declared, control, found.supply, conditions, {})
+    report.assumed = found.assumed
+    return report
 
 
 # Plain CAN
@@ -256,6 +271,8 @@ def _periodic(message: BusMessage, timing: Timing, accuracy: SlotAccuracy, refus
 
 
 async def _print(report: Report, output: Output, *, summary: bool) -> None:
+    for line in report.assumed:
+        notify(f"assumed: {line}")
     if summary:
         await output.put(report.summary, _in_words(report.summary))
     else:

@@ -1,4 +1,7 @@
-"""The messages that a live RTCAN bus carries, for `r2p bus analyze --via`: measured, as nobody declares them."""
+"""The messages that a live RTCAN bus carries, for `r2p bus analyze --via rtcan:can0`, measured frame by frame.
+
+Modules announce the classes of their publishers; neither periods nor deadlines.
+"""
 
 from collections import defaultdict
 
@@ -6,7 +9,8 @@ import msgspec
 
 from r2p.analysis import BusMessage, MessageClass, SlotSupply, management_load
 from r2p.bus import BusMonitor, FrameKind, SeenFrame, Timing
-from r2p.codecs import rtcan
+from r2p.codecs import PublisherClass, rtcan
+from r2p.tools.bus.reported import declared_otherwise, named
 from r2p.units import MILLISECOND, SECOND
 
 CONTROL_LAXITY_MAX = 10
@@ -52,6 +56,8 @@ class LiveBus(msgspec.Struct):
     duration: int
     mask: int = 1
     messages: dict[tuple[int, FrameKind], SeenMessage] = {}
+    publishers: dict[tuple[str, str], PublisherClass] = {}
+    """The classes that were announced meanwhile, by topic and module."""
 
     def see(self, frame: SeenFrame) -> None:
         """Take in a frame."""
@@ -70,20 +76,25 @@ class LiveBus(msgspec.Struct):
 
     @property
     def declared(self) -> list[BusMessage]:
-        """The topics, with the shortest time between two messages as their period."""
+        """The topics, with the shortest time between two messages as their period; one that was sent once has the whole
+        time. Messages that were sent as events, as their topic had no slots yet, are left out.
+        """
         return [
             BusMessage(
                 name=seen.topic,
                 node=seen.module,
                 id=message,
                 size=max(1, seen.size),
-                period=None if kind is FrameKind.NRT else seen.shortest,
+                period=None if kind is FrameKind.NRT else seen.shortest or self.duration,
                 deadline=max(1, seen.laxity) * MILLISECOND if kind is FrameKind.SRT else None,
                 message_class=_CLASSES[kind],
             )
             for (message, kind), seen in self.messages.items()
-            if kind in _CLASSES
+            if kind in _CLASSES and not self._gained_slots(message, kind)
         ]
+
+    def _gained_slots(self, message: int, kind: FrameKind) -> bool:
+        return kind is FrameKind.SRT and (message, FrameKind.HRT) in self.messages
 
     @property
     def control(self) -> list[BusMessage]:
@@ -98,6 +109,21 @@ class LiveBus(msgspec.Struct):
             {module: max(1.0, rate) for module, rate in rates.items()}, max(other.values(), default=0)
         )
 
+    @property
+    def assumed(self) -> list[str]:
+        """What the analysis assumes, a line each."""
+        sent = {(seen.topic, seen.module) for (_, kind), seen in self.messages.items() if kind in _CLASSES}
+        slotted = {(seen.topic, seen.module) for (_, kind), seen in self.messages.items() if kind is FrameKind.HRT}
+        lines = [
+            f"periods: the shortest of {self.duration / SECOND:g} s; deadlines: the laxity of the frames",
+            "a slot that was reserved in any cycle is taken in all of them",
+            *declared_otherwise(self.publishers, sent, slotted),
+        ]
+        gained = [(seen.topic, seen.module) for key, seen in self.messages.items() if self._gained_slots(*key)]
+        if gained:
+            lines.append(f"counted in their slots only, though sent without for a while: {named(gained)}")
+        return lines
+
 
 async def watch(bus: BusMonitor, duration: float) -> LiveBus:
     """Listen to a bus for so many seconds."""
@@ -108,5 +134,5 @@ async def watch(bus: BusMonitor, duration: float) -> LiveBus:
         if frame.stamp > end:
             break
         live.see(frame)
-    live.timing = bus.timing
+    live.timing, live.publishers = bus.timing, bus.publishers
     return live

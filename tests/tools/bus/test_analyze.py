@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 import r2p
@@ -18,8 +20,12 @@ from r2p.sim import SimCan, run
 from r2p.sim.can import CanNode
 from r2p.sim.transport import SimPort
 from r2p.testing.network import node_in
+from r2p.tools.bus import analyze as analyze_command
 from r2p.tools.bus import app
 from r2p.tools.bus.live import LiveBus, watch
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
 
 SETS = Path(__file__).parents[2] / "golden" / "sets"
 ROBOT = """
@@ -151,29 +157,117 @@ def test_a_bad_file_says_which_and_why(tmp_path: Path) -> None:
     assert f"{path}: a: 9 bytes: a frame has up to 8" in " ".join(error.split())
 
 
+@asynccontextmanager
+async def two_modules(*vias: Any) -> AsyncIterator[None]:
+    """A sends B an event each 50 ms, a periodic topic in slots, and nothing of a third topic."""
+    a, b = (r2p.Module(name, via=via, watchdog=False) for name, via in zip("AB", vias, strict=True))
+    async with a, b, node_in(a) as sender, node_in(b) as receiver:
+        leds = sender.advertise("leds", Led, r2p.Sporadic(deadline=0.020))
+        speed = sender.advertise("speed", Led, r2p.Periodic(period=0.010, fill=lambda: Led(led=1)))
+        sender.advertise("idle", Led)
+        for topic in ("leds", "speed", "idle"):
+            receiver.subscribe(topic, Led)
+        sending = asyncio.create_task(_send(leds))
+        try:
+            await speed.ready(10)
+            yield
+        finally:
+            sending.cancel()
+
+
+async def _send(leds: r2p.SporadicPublisher[Led]) -> None:
+    while True:
+        await leds.publish(Led(led=2))
+        await asyncio.sleep(0.050)
+
+
+async def analyze_here(*arguments: str) -> None:
+    """Run the command with these arguments in this event loop, as its network is only in there."""
+    group: Any = typer.main.get_command(app)
+    given = group.commands["analyze"].make_context("analyze", list(arguments)).params
+    await analyze_command.analyze(**{name: value for name, value in given.items() if name not in ("verbose", "quiet")})
+
+
+def test_what_the_modules_of_a_bus_say_is_analyzed(capsys: pytest.CaptureFixture[str]) -> None:
+    """Through a gateway, from a network without slots: by announcements, bus_load and bus_slots."""
+
+    async def main() -> None:
+        gateway = r2p.Module("GW", via=["sim:lab", "memory:outside"], bridge=True, watchdog=False)
+        async with gateway, two_modules("sim:lab", "sim:lab"):
+            await analyze_here("--via", "memory:outside", "--for", "3s", "--format", "json", "--no-control")
+
+    run(main, seed=1)
+    printed = capsys.readouterr()
+    rows = {row["name"]: row for row in map(json.loads, printed.out.splitlines())}
+    leds, speed = rows["leds"], rows["speed"]
+    assert (leds["node"], leds["class"], leds["bytes"], leds["result"]) == ("A", "srt", 5, "in time")
+    assert leds["period_ms"] == leds["deadline_ms"] == pytest.approx(50, rel=0.05)
+    assert (speed["node"], speed["class"], speed["bytes"], speed["period_ms"]) == ("A", "hrt", 5, 9.96)
+    assert "assumed: periods: messages come evenly" in printed.err
+    assert "nothing was sent: idle of A\n" in printed.err
+
+
+def test_the_sums_of_a_bus_have_its_slots(capsys: pytest.CaptureFixture[str]) -> None:
+    async def main() -> None:
+        async with two_modules("sim:lab", "sim:lab"):
+            await asyncio.sleep(2)  # what modules announce after their start is over
+            for control in ("--control", "--no-control"):
+                await analyze_here("--via", "sim:lab", "--for", "2s", "--format", "json", "--summary", control)
+
+    run(main, seed=1)
+    summary, without = map(json.loads, capsys.readouterr().out.splitlines())
+    assert summary["messages"] == without["messages"]
+    assert summary["load"] > without["load"]
+    assert summary["reserved"] == pytest.approx(2 / 60, abs=1e-4)
+    assert summary["slot_us"] == 166.0
+
+
+def test_nothing_is_said_of_a_bus() -> None:
+    async def main() -> None:
+        async with r2p.Module("A", via="memory:lab", watchdog=False):
+            await analyze_here("--via", "memory:lab")
+
+    with pytest.raises(r2p.Error, match="no module of memory:lab reports an RTCAN bus"):
+        run(main, seed=1)
+
+
+def test_identifiers_are_not_reported(tmp_path: Path) -> None:
+    code, _, error = analyze("--via", "memory:lab", "--dbc", str(tmp_path / "net.dbc"))
+    assert code == 2
+    assert "--dbc needs the identifiers of the frames" in " ".join(error.split())
+
+
+def test_frames_of_a_live_bus_are_analyzed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        can = SimCan(seed=1)
+        listener = SimPort(can, CanNode("listener", listen_only=True))
+        monkeypatch.setattr(analyze_command, "listen", lambda _settings: BusMonitor(listener))
+        watching = asyncio.create_task(analyze_here("--via", "rtcan:can0", "--for", "8s", "--format", "json"))
+        async with two_modules(can.transport(), can.transport()):
+            await watching
+
+    run(main, seed=1)
+    printed = capsys.readouterr()
+    rows = {row["name"]: row for row in map(json.loads, printed.out.splitlines())}
+    assert rows["leds"]["deadline_ms"] == 19.0
+    assert rows["speed"]["class"] == "hrt"
+    assert "assumed: periods: the shortest of 8 s; deadlines: the laxity of the frames" in printed.err
+    assert "nothing was sent: idle of A\n" in printed.err
+
+
 def test_a_live_bus_is_measured() -> None:
     async def main() -> LiveBus:
         can = SimCan(seed=1)
         listener = SimPort(can, CanNode("listener", listen_only=True))
-        a, b = (r2p.Module(name, via=can.transport(), watchdog=False) for name in "AB")
-        async with a, b, node_in(a) as sender, node_in(b) as receiver:
-            watching = asyncio.create_task(_watched(listener))
-            leds = sender.advertise("leds", Led, r2p.Sporadic(deadline=0.020))
-            speed = sender.advertise("speed", Led, r2p.Periodic(period=0.010, fill=lambda: Led(led=1)))
-            receiver.subscribe("leds", Led)
-            receiver.subscribe("speed", Led)
-            await asyncio.sleep(4)
-            await speed.ready(5)
-            for _ in range(60):
-                await leds.publish(Led(led=2))
-                await asyncio.sleep(0.050)
+        watching = asyncio.create_task(_watched(listener))
+        async with two_modules(can.transport(), can.transport()):
             return await watching
 
     async def _watched(listener: SimPort) -> LiveBus:
         async with BusMonitor(listener) as bus:
             return await watch(bus, 6.0)
 
-    live = run(main())
+    live = run(main)
     declared = {each.name: each for each in live.declared}
     assert {"leds", "speed"} <= declared.keys()
     leds, speed = declared["leds"], declared["speed"]
