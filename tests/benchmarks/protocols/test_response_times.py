@@ -1,7 +1,6 @@
 """Plain CAN on the simulated bus beside published response times: the bus is that of the literature.
 
-The formula here is the shortest that gives the published numbers (Davis, Burns, Bril, Lukkien 2007): response to the
-last bit of the frame, without the intermission.
+The published numbers are responses to the last bit of the frame, without the intermission, as those of `r2p.analysis`.
 """
 
 from __future__ import annotations
@@ -21,12 +20,13 @@ from benchmarks.protocols import message_sets
 from benchmarks.protocols.fixed_priority import FIRST_IDENTIFIER, PlainCan
 from benchmarks.protocols.message_sets import MessageSet, SetMessage, longest_bits, named_set
 from benchmarks.protocols.network import ProtocolSetup
+from r2p.analysis import BusMessage, bit_time, response_bounds
 from r2p.codecs.can_bits import INTERMISSION, OtherFrame, frame_bits
 from r2p.sim import run
 from r2p.units import MILLISECOND, SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
 BROSTER = named_set("broster")
 _FILE = Path(message_sets.__file__).parent / "sets" / "broster12_250k.csv"
@@ -44,34 +44,16 @@ class InFileOrder(PlainCan):
         self.bus.timeline.at(at, lambda: box.put(box.track.release(at)))
 
 
-def response_times(messages: MessageSet, lengths: Sequence[int]) -> list[int]:
-    """Worst-case response times in ns; `lengths` in bits, with the intermission; deadlines not above periods."""
-    return [_response_time(messages, lengths, place) for place in range(len(lengths))]
-
-
-def _response_time(messages: MessageSet, lengths: Sequence[int], place: int) -> int:
-    message, bit = messages.messages[place], SECOND // messages.bitrate
-    own, blocking = lengths[place], max(lengths[place + 1 :], default=INTERMISSION)
-    busy = _settled(lambda t: blocking + _interference(messages, lengths[: place + 1], t, bit), own)
-    responses = []
-    for instance in range(-(-busy * bit // message.period)):
-        waits = _settled(partial(_queued, messages, lengths[:place], blocking + instance * own), blocking)
-        responses.append((waits + own - INTERMISSION) * bit - instance * message.period)
-    return max(responses)
-
-
-def _queued(messages: MessageSet, upper: Sequence[int], ahead: int, waits: int) -> int:
-    return ahead + _interference(messages, upper, waits + 1, SECOND // messages.bitrate)
-
-
-def _settled(step: Callable[[int], int], value: int) -> int:
-    while (after := step(value)) != value:
-        value = after
-    return value
-
-
-def _interference(messages: MessageSet, lengths: Sequence[int], bits: int, bit: int) -> int:
-    return sum(-(-bits * bit // each.period) * length for each, length in zip(messages.messages, lengths, strict=False))
+def response_times(messages: MessageSet) -> list[int | None]:
+    """Return the worst-case response times by `r2p.analysis` (ns), with priorities in the order of the set."""
+    found = response_bounds(
+        [
+            BusMessage(name=each.name, size=each.size, period=each.period, deadline=each.deadline, id=place)
+            for place, each in enumerate(messages.messages)
+        ],
+        bit_time(messages.bitrate),
+    )
+    return [each.bound for each in found]
 
 
 @cache
@@ -119,9 +101,8 @@ def published() -> list[int]:
         return [round(float(row["expected_wctt_ms_250k"]) * MILLISECOND) for row in csv.DictReader(lines)]
 
 
-def test_the_formula_gives_the_published_response_times() -> None:
-    lengths = [longest_bits(each.size) for each in BROSTER.messages]
-    assert response_times(BROSTER, lengths) == published()
+def test_the_analysis_gives_the_published_response_times() -> None:
+    assert response_times(BROSTER) == published()
 
 
 @pytest.mark.parametrize("place", range(12))
@@ -152,7 +133,7 @@ def test_the_counterexample_misses_in_the_second_instance() -> None:
     davis = named_set("davis")
     assert [longest_bits(each.size) for each in davis.messages] == [125] * 3
     bit = SECOND // davis.bitrate
-    assert response_times(davis, [125] * 3) == [(2 * 125 - 3) * bit, (3 * 125 - 3) * bit, 3_500_000]
+    assert response_times(davis) == [(2 * 125 - 3) * bit, (3 * 125 - 3) * bit, 3_500_000]
 
     length = 110
     scaled = [

@@ -18,7 +18,7 @@ from r2p.testing.network import node_in
 from r2p.tools.topic.echo import echo
 from r2p.units import SECOND
 from tests.tools.rig import VIA, printed, tool
-from tests.transports.rtcan.networks import CYCLE, SLOT, Lab, lab
+from tests.transports.rtcan.networks import CYCLE, SLOT, Lab, lab, until
 
 pytestmark = pytest.mark.virtual_time
 
@@ -91,15 +91,18 @@ async def test_the_numbers_are_those_of_the_bus() -> None:
 
 
 async def test_error_frames_are_counted() -> None:
+    """Those of the module that watches, which its controller reports."""
     async with lab("MOTOR", "EYE") as (bus, nodes), encoder(bus, nodes):
         samples = nodes[0].subscribe("bus_load", BusTraffic, queue=100).samples()
         assert (await second_of(samples))[0].message.errors == 0
-        bus.can.bus.noise = 0.1
+        bus.can.bus.disturb_next(count=3, sender="EYE")
+        bus.can.bus.disturb_next(count=2, sender="MOTOR")
         rows = await second_of(samples)
         end = period_end(rows[0])
         failed = [each for each in bus.frames if each.error is not None and end - SECOND <= each.end < end]
+        assert sorted(each.senders for each in failed) == [("EYE",)] * 3 + [("MOTOR",)] * 2
         assert rows[0].source.module == "EYE"
-        assert rows[0].message.errors == sum("EYE" in each.senders for each in failed) > 0
+        assert rows[0].message.errors == 3
 
 
 async def test_it_reaches_a_subscriber_behind_a_gateway_and_costs_the_bus_nothing() -> None:
@@ -119,7 +122,7 @@ async def test_without_a_subscriber_nothing_is_advertised_and_frames_are_filtere
     async with lab("MOTOR", "EYE") as (bus, nodes), encoder(bus, nodes):
         port = bus.link("EYE").driver.port  # of both, the first by name publishes
         assert isinstance(port, SimPort)
-        await asyncio.sleep(1.0)  # both have found each other
+        await until(lambda: len(port.controller.filters) == 4)  # three that are always there, and the encoder's
         filters = port.controller.filters
         subscriber = nodes[0].subscribe("bus_load", BusTraffic)
         await second_of(subscriber.samples())
