@@ -29,11 +29,13 @@ class KeyedTimers:
         self._due[key] = due
         if before is None or due < before:
             self._push(key, due)
+        elif before != self.due:  # as each renewed lease: another key is the first one, and stays it
+            return
         self._update()
 
     def clear(self, key: Hashable) -> None:
-        self._due.pop(key, None)
-        self._update()
+        if self._due.pop(key, None) == self.due:
+            self._update()
 
     def next(self) -> int | None:
         """Return when the next key expires (ns)."""

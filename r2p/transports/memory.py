@@ -129,9 +129,13 @@ class MemoryNetwork:
 
     def send(self, datagram: Datagram) -> None:
         """Send to all other ports."""
-        for address in self._ports:
-            if address != datagram.port:
+        others = [address for address in self._ports if address != datagram.port]
+        if self._has_faults():
+            for address in others:
                 self._send_to(address, datagram)
+        else:
+            self._in_flight += len(others) * _places(datagram)
+            asyncio.get_running_loop().call_soon(self._arrive_everywhere, others, datagram)
 
     def send_to(self, address: int, datagram: Datagram) -> None:
         """Send to one port, if it is still there."""
@@ -145,6 +149,9 @@ class MemoryNetwork:
         if was_full and not self.full:
             for port in list(self._ports.values()):
                 port.made_room()
+
+    def _has_faults(self) -> bool:
+        return bool(self.loss or self.duplicate or self.reorder or self.delay or self.jitter)
 
     def _send_to(self, address: int, datagram: Datagram) -> None:
         if self._happens(self.loss):
@@ -176,6 +183,10 @@ class MemoryNetwork:
             in_background(loop.call_later(delay, self._arrive, address, datagram))
         else:
             loop.call_soon(self._arrive, address, datagram)
+
+    def _arrive_everywhere(self, addresses: list[int], datagram: Datagram) -> None:
+        for address in addresses:
+            self._arrive(address, datagram)
 
     def _arrive(self, address: int, datagram: Datagram) -> None:
         port = self._ports.get(address)

@@ -6,6 +6,7 @@ Every table is bounded. A full one forgets the entry that was not repeated for l
 messages pushes out true entries only until they are repeated.
 """
 
+import copy
 from collections import Counter
 from collections.abc import Hashable
 from typing import TypeVar
@@ -28,6 +29,7 @@ LEASE = 5 * SECOND
 FOR_EVER = management.LEASE_MS_MAX * MILLISECOND
 """The longest lease of a HELLO (ns): its subscriptions last as long as the module does."""
 
+_UNKNOWN = TopicType()
 _TopicRole = tuple[str, int]
 K = TypeVar("K")
 V = TypeVar("V")
@@ -178,6 +180,15 @@ class Directory:
             release=message.release,
         )
 
+    def refresh(self, now: int, info: ModuleInfo) -> None:
+        """Note that a module lives of which nothing has changed."""
+        fresh = copy.copy(info)
+        msgspec.structs.force_setattr(fresh, "last_heard", now)
+        del self.modules[info.name]  # to enter it as the last one again
+        self.modules[info.name] = fresh
+        if not info.hops:
+            self._direct[info.source][info.name] = fresh
+
     def enter(self, info: ModuleInfo) -> ModuleInfo | None:
         """Enter a module; return the one that was forgotten for it, if the table was full."""
         before = self.modules.get(info.name)
@@ -234,12 +245,13 @@ class Directory:
     def add_type(self, now: int, topic: str, role: int, said: TopicType) -> TopicInfo:
         """Enter the type from a peer. Of several different ones the first stays, as long as it is repeated."""
         info = self.touch_topic(topic)
-        for each, at in list(info.typed_at.items()):
-            if now > at + LEASE:
-                del info.typed_at[each]
-                info.set_type(each, None)
-        known = info.types.get(role, TopicType())
-        if said != TopicType() and known.fits(said):
+        for each in [each for each, at in info.typed_at.items() if now > at + LEASE]:
+            del info.typed_at[each]
+            info.set_type(each, None)
+        known = info.types.get(role, _UNKNOWN)
+        if said == known and role in info.typed_at:  # as almost always
+            info.typed_at[role] = now
+        elif said != _UNKNOWN and known.fits(said):
             if known.fingerprint in {management.ANY_TYPE, said.fingerprint}:
                 info.typed_at[role] = now
             info.set_type(role, known.merged(said))

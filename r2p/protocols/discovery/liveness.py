@@ -75,6 +75,11 @@ class PeerLiveness:
 
     def alive(self, now: int, message: management.Alive, source: PeerAddress) -> None:
         """Handle ALIVE: the state of any module."""
+        known = self._directory.modules.get(message.module)
+        if known is not None and known.flags == message.flags and self._is_settled(known):
+            self._directory.refresh(now, known)
+            self._timers.set(("module", known.name), now + known.lease)
+            return
         if not self._is_possible(message.module):
             return
         if not self._is_short(message.module):
@@ -146,6 +151,10 @@ class PeerLiveness:
         self._echoing_until = 0
         for info in [info for info in self._directory.modules.values() if info.r2p]:
             self._remove(now, info)
+
+    def _is_settled(self, info: ModuleInfo) -> bool:
+        """Return whether a module on the link itself has this very name, and no other module has."""
+        return info.r2p and not info.hops and info.name != self._module and info.name not in self._unnamed
 
     # Names
 

@@ -205,8 +205,12 @@ class Schedule:
     def due(self) -> int:
         """Return when to call `pop` (ns)."""
         # The cost of an item is known only when its messages are made: there must be room for the most possible.
-        turn = 0 if self._fresh or self._relayed else self._turn_at()
-        return max(turn, self._held, self._bucket.ready_at(_ITEM_MESSAGES))
+        at = self._bucket.ready_at(_ITEM_MESSAGES)
+        if self._held > at:  # no `max`: this is called for each message that is received
+            at = self._held
+        if not (self._fresh or self._relayed) and (turn := self._turn_at()) > at:
+            at = turn
+        return at
 
     def pop(self, now: int) -> Item | None:
         """Return the item to announce now, if any; `sent` takes its cost."""
@@ -315,11 +319,15 @@ class Schedule:
             self._lap = len(self._ring)  # then those that wait for an answer are looked at once more
 
     def _turn_at(self) -> int:
-        self._eager = min(self._eager, self._count)
-        turn = 0 if self._eager else min(self._step_at, self._presence_at)
-        if self._repeat_at is not None:
-            turn = min(turn, self._repeat_at)
-        return max(turn, min(self._traffic_at + self._quiet, self._step_at + _QUIET_MAX))
+        if self._eager > self._count:
+            self._eager = self._count
+        turn = 0 if self._eager else self._step_at if self._step_at < self._presence_at else self._presence_at
+        if self._repeat_at is not None and self._repeat_at < turn:
+            turn = self._repeat_at
+        quiet_at, latest = self._traffic_at + self._quiet, self._step_at + _QUIET_MAX
+        if latest < quiet_at:
+            quiet_at = latest
+        return turn if turn > quiet_at else quiet_at
 
 
 def _next(ring: OrderedDict[Item, None]) -> Item:

@@ -524,9 +524,13 @@ class Discovery(DiscoveryProtocol):
             self.counts["link down"] += 1
             return []
         self._schedule.traffic(now)  # whatever it is, it took time on a line that is to be quiet
-        message = self._decode(management.decode, data)
+        try:
+            message = management.decode(data)
+        except DecodeError as error:
+            self._count_undecodable(error)
+            return []
         handler = self._handlers.get(type(message))
-        if message is not None and handler is not None and not self._liveness.drop_echo(now, data):
+        if handler is not None and not self._liveness.drop_echo(now, data):
             message = self._names.from_wire(message)
             handler(now, message, source)  # before demand, which looks up the leases that a HELLO has set
             if self._demand is not None:

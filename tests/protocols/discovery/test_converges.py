@@ -19,6 +19,8 @@ SHAPES = [TopicType(), TopicType(5), TopicType(5, b"\x01" * 8), TopicType(5, b"\
 RATE, BURST = 100.0, 8
 SETTLED = 25.0
 """Seconds after the last loss: the longest lease, a round, a lease again, and the longest delay."""
+LINGERS = 60.0
+"""Seconds that a subscription lasts longer whose UNSUBSCRIBE was lost, while its module is there."""
 
 
 class Wish(msgspec.Struct, frozen=True):
@@ -89,6 +91,13 @@ def check(
         assert (topic, m.ROLE_PUBLISHES) in subscriber.mismatched
 
 
+def lingers(world: World, latest: dict[tuple[bool, str], Wish]) -> bool:
+    """Return whether a side still sends what the other one no longer wants."""
+    wanted = {key for key, wish in latest.items() if wish.subscribes is not None}
+    sides = ((world.a, False), (world.b, True))
+    return any((other_is_a, topic) not in wanted for side, other_is_a in sides for topic in side.attached)
+
+
 def rate_kept(side: Side) -> bool:
     times = side.unsolicited
     return all(
@@ -105,6 +114,8 @@ def test_they_agree_when_the_losses_stop(line: Line, steps: list[Change], seed: 
     latest = apply(world, steps)
     world.line = Line()
     world.run(SETTLED)
+    if lingers(world, latest):
+        world.run(LINGERS)
     for topic in TOPICS:
         a, b = (latest.get((of_a, topic), Wish(topic, None, None)) for of_a in (True, False))
         check(world.a, world.b, topic, a.publishes, b.subscribes)
