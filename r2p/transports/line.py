@@ -1,9 +1,10 @@
 """The debug line: lines of ASCII (PROTOCOL.md 3) to and from one other end, over any carrier of bytes.
 
-The first line written in a turn of the event loop is sent at once, the others of that turn in one piece. While the
-carrier (TCP connection, serial port) takes no more, lines wait here, where management can overtake samples. Those of
-real-time publishers never wait: each is sent at once, before all waiting ones, or its publisher keeps it and watches
-the time. A carrier is attached while it lives. The link outlasts it, and so do its subscriptions and counters.
+The first line written in a turn of the event loop is sent at once, the others of that turn in one piece; to one of many
+clients of a server, all of them go in one piece. While the carrier (TCP connection, serial port) takes no more, lines
+wait here, where management can overtake samples. Those of real-time publishers never wait: each is sent at once, before
+all waiting ones, or its publisher keeps it and watches the time. A carrier is attached while it lives. The link
+outlasts it, and so do its subscriptions and counters.
 
 `UnconfirmedBytes` finds out how many messages a broken connection may have lost.
 """
@@ -135,7 +136,7 @@ class LineLink(BufferedLink):
         self._management: deque[bytes] = deque()
         self._samples: deque[bytes] = deque()
         self._buffered_bytes = 0  # bytes in these three queues
-        self._corked = False  # whether a line was sent in this turn of the loop, so that others wait for its end
+        self._corked = False  # whether lines wait for the end of this turn of the loop
         self._blocked = False  # whether the carrier is full
         self._limit = self._buffer = buffer  # bytes that may wait; -1 while samples have to wait for the grace period
         self._grace: asyncio.TimerHandle | None = None
@@ -183,6 +184,8 @@ class LineLink(BufferedLink):
         """Begin to exchange messages: the connection is up, and its other end has proven the key, if there is one."""
         if self._gate is not None:
             self.denied, self.key_refused = False, ""
+        if self.lossless:
+            self.discovery.set_lossless()
         self._begin_grace()
         self.on_up()
 
@@ -270,7 +273,7 @@ class LineLink(BufferedLink):
             return
         self.stats.sent += 1
         real_time = sample.publisher_class != _NRT
-        if self._blocked or (self._corked and not real_time):
+        if self._blocked or (not real_time and (self._corked or self._is_corked())):
             self._samples.append(line)
             self._buffered_bytes += len(line)
             if self._buffered_bytes >= self._limit:
@@ -299,7 +302,7 @@ class LineLink(BufferedLink):
             return
         deadline = self._clock.now() // 1000 + debug.NO_DEADLINE
         line = debug.encode(topic, data, deadline)
-        if not (self._corked or self._blocked):
+        if not (self._is_corked() or self._blocked):
             self._send_at_once(line)
             return
         self._buffered_bytes += len(line)
@@ -379,10 +382,24 @@ class LineLink(BufferedLink):
 
     # The send buffer. The fewer pieces the better: each is a system call, which takes longer than all else here.
 
+    @property
+    def gathers(self) -> bool:
+        """Return whether the first line of a turn goes in one piece with the others, too, instead of at once."""
+        return False
+
+    def _is_corked(self) -> bool:
+        """Return whether lines wait for the end of this turn."""
+        if not self._corked and self.gathers:
+            self._cork()
+        return self._corked
+
+    def _cork(self) -> None:
+        self._corked = True
+        self._space.loop.call_soon(self._uncork)
+
     def _send_at_once(self, line: bytes) -> None:
         if not self._corked:
-            self._corked = True
-            self._space.loop.call_soon(self._uncork)
+            self._cork()
         self._send(line)
 
     def _uncork(self) -> None:

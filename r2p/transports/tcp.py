@@ -14,7 +14,7 @@ import os
 import re
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from typing import Any, cast
 
 if sys.platform == "linux":
@@ -37,6 +37,7 @@ PORT = 2323
 MAX_CLIENTS = 200
 """Connections that `tcp-listen:` serves at once, unless `max_clients=` says otherwise."""
 
+_MANY = 16  # clients from which on one piece a turn for each is worth more than that the first line goes at once
 _REFUSED_MAX = 8  # refused clients that are sent the reason at a time; others are cut off
 _REFUSED_S = 0.5  # seconds for a refused client to read the reason and close
 _CHUNK = 16 * 1024  # bytes read at once: what one turn of the loop can decode without making others wait long
@@ -284,11 +285,19 @@ class TcpListenTransport(Transport):
 
 
 class _ClientLink(LineLink):
-    """The link of a server to one client; `close` ends the connection of one without the key."""
+    """The link of a server to one client; `close` ends the connection of one without the key.
 
-    def __init__(self, peer: str, hub: Hub, close: Callable[[str], None]) -> None:
+    `served` are all that the server has.
+    """
+
+    def __init__(self, peer: str, hub: Hub, close: Callable[[str], None], served: Sized) -> None:
         super().__init__(peer, hub)
         self._close_connection = close
+        self._served = served
+
+    @property
+    def gathers(self) -> bool:
+        return len(self._served) >= _MANY
 
     def refuse_key(self, reason: str) -> None:
         self._close_connection(reason)
@@ -311,7 +320,7 @@ class _ServerConnection(_TcpConnection):
         if len(self._server.served) >= self._server.max_clients:
             self._refuse(transport)
             return None
-        link = _ClientLink(peer, self._hub, self._key_refused)
+        link = _ClientLink(peer, self._hub, self._key_refused, self._server.served)
         link.use_key(self._server.key, LinkEnd.SERVER)
         link.lossless = True
         link.transient = True

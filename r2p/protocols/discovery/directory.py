@@ -116,6 +116,8 @@ class Directory:
         """Timers of everything that lasts for a while on this link."""
         self.counts = counts
         """Counts of what was dropped on this link, by reason."""
+        self.is_lossless = False
+        """Whether all that is sent arrives, for as long as the link is up."""
         self._direct: dict[PeerAddress, dict[str, ModuleInfo]] = {}
         self._leases: dict[PeerAddress, Counter[int]] = {}
         self._names: dict[int, str] = {}
@@ -130,8 +132,14 @@ class Directory:
 
     @property
     def crowd(self) -> int:
-        """The number of r2p modules, if they are many and all on the link know crowds; else 0."""
-        return len(self._names) if len(self._names) >= CROWD and not self._others else 0
+        """The number of r2p modules for which topics are repeated slowly; 0: they are repeated in every round.
+
+        There must be many, and all on the link must know crowds. Where nothing is lost, one is as good as many.
+        """
+        modules = len(self._names)
+        if self._others or modules < (1 if self.is_lossless else CROWD):
+            return 0
+        return max(modules, CROWD_ROUNDS) if self.is_lossless else modules
 
     def sole_peer(self) -> int | None:
         """The instance of the only r2p module on the link itself, not behind a gateway; None unless there is one."""

@@ -321,13 +321,19 @@ class Schedule:
     def _turn_at(self) -> int:
         if self._eager > self._count:
             self._eager = self._count
-        turn = 0 if self._eager else self._step_at if self._step_at < self._presence_at else self._presence_at
+        turn = self._presence_at
+        if self._eager:
+            turn = 0
+        elif self._step_at < turn:
+            turn = self._step_at
         if self._repeat_at is not None and self._repeat_at < turn:
             turn = self._repeat_at
         quiet_at, latest = self._traffic_at + self._quiet, self._step_at + _QUIET_MAX
         if latest < quiet_at:
             quiet_at = latest
-        return turn if turn > quiet_at else quiet_at
+        if turn > quiet_at:
+            return turn
+        return quiet_at
 
 
 def _next(ring: OrderedDict[Item, None]) -> Item:

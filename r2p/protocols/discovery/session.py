@@ -108,6 +108,12 @@ class DiscoveryProtocol(ABC):
         """Return the address of an r2p module on the link itself; None if it is not known, or behind a gateway."""
         return None
 
+    def set_lossless(self) -> None:
+        """Note that all that is sent arrives, for as long as the link is up: little needs to be repeated.
+
+        Nothing is to be done where nothing is repeated, anyway.
+        """
+
     def refresh_ages(self, now: int) -> None:
         """Bring the times at which things were heard up to date, before they are read.
 
@@ -472,6 +478,9 @@ class Discovery(DiscoveryProtocol):
         Repetitions wait for `quiet` seconds without management traffic. `rate` and `burst`: as for the class.
         """
         self._schedule.set_pace(rate, burst, round(quiet * SECOND))
+
+    def set_lossless(self) -> None:
+        self._directory.is_lossless = True
 
     def hold(self, until: int) -> None:
         """Announce nothing before `until` (monotonic ns), as what was announced is not on the link yet."""
