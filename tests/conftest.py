@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import os
 import signal
 import sys
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 
 pytest_plugins = ["pytester"]
 
-hypothesis.settings.register_profile("r2p", deadline=None)  # how long an example takes depends on the machine
+# How long an example takes depends on the machine. Each run tries other examples; R2P_EXAMPLES=1000 takes long.
+hypothesis.settings.register_profile("r2p", deadline=None, max_examples=int(os.environ.get("R2P_EXAMPLES", "40")))
 hypothesis.settings.load_profile("r2p")
 
 _NO_UVLOOP = pytest.mark.skipif(sys.platform == "win32", reason="uvloop is not made for Windows")

@@ -1,5 +1,6 @@
 """How the cost grows, in operations that are counted instead of time; and the picture for the documentation."""
 
+import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,8 @@ import pytest
 from benchmarks.growth import draw, router_mesh, zenoh_network
 from benchmarks.growth.curve import Curve, exponent
 from benchmarks.growth.router_mesh import Sent
-from r2p.codecs import liveliness
+from r2p.codecs import liveliness, management
+from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.liveliness.session import LivelinessDiscovery
 
 
@@ -59,6 +61,36 @@ def test_a_module_that_joins_a_network_works_in_proportion_to_its_size() -> None
 def test_keys_grow_with_modules_and_one_change_is_one_key() -> None:
     assert exponent([(n, len(zenoh_network.keys(n))) for n in (3, 30)]) == pytest.approx(1.0)
     assert len(zenoh_network.keys(3)) == 6
+
+
+def test_what_is_repeated_costs_the_same_whatever_the_number_of_modules() -> None:
+    points = []
+    for modules in (10, 40, 160):
+        hears = Discovery("HEARS", 0xFFFF)
+        hears.link_up(0)
+        repeated = [
+            [management.encode(each) for each in said]
+            for said in zip(*(announcements(number) for number in range(modules)), strict=True)
+        ]
+
+        def hear(hears: Discovery = hears, repeated: list[list[bytes]] = repeated) -> None:
+            for said in repeated:
+                for number, data in enumerate(said):
+                    hears.receive(1, data, number)
+
+        hear()
+        points.append((modules, calls(hear)))
+        assert len(hears.modules) == len(hears.topics) == modules
+        assert calls(functools.partial(hears.receive, 2, repeated[1][0], 0)) < 20
+    power = exponent(points)
+    assert power is not None
+    assert power < 1.02
+
+
+def announcements(number: int) -> tuple[management.Management, ...]:
+    name = f"M{number}"
+    hello = management.Hello(name, number + 1, lease_ms=60_000, wire=management.WIRE_VERSION)
+    return hello, management.Alive(name, 0), management.Advertise(f"t{number}", 8)
 
 
 def test_time_at_rest_is_nothing() -> None:

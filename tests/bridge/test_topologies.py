@@ -13,7 +13,7 @@ import pytest
 from r2p.sim import run
 from tests.bridge.world import World
 
-SHARE = 10
+SHARE = 7
 CALM = 2.0
 """Seconds after which everything flows."""
 

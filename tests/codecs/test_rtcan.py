@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -301,7 +302,10 @@ def test_no_other_module_knows_the_layout_of_an_identifier() -> None:
     for path in sorted(Path(r2p.__file__).parent.rglob("*.py")):
         if path.parts[-2:] in {("codecs", "rtcan.py"), ("codecs", "can_bits.py"), ("loader", "relocations.py")}:
             continue
-        for node in ast.walk(ast.parse(path.read_text())):
+        source = path.read_text()
+        if re.search(r"(<<|>>)=?\s*(7|15|18|23|29)\b", source) is None:  # to parse all takes seconds
+            continue
+        for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.BinOp) and isinstance(node.op, ast.LShift | ast.RShift):
                 amount = node.right.value if isinstance(node.right, ast.Constant) else None
                 assert amount not in numbers, f"{path}:{node.lineno} shifts by {amount}: use r2p.codecs.rtcan"

@@ -12,7 +12,7 @@ from r2p.protocols.bridge.link_selection import LinkSelection
 from tests.protocols.bridge.test_tree import SECOND, STABLE, _connected, _talk, _trouble, reached, start, states, world
 from tests.protocols.bridge.wires import MS, Module, World
 
-SHARE = 6
+SHARE = 3
 
 
 def module(made: World, networks: str, identity: int = 50_000) -> Module:

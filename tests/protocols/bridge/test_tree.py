@@ -15,7 +15,7 @@ from tests.protocols.bridge.wires import MS, Gateway, World
 
 SECOND = 1_000 * MS
 STABLE = 2 * SECOND
-SHARE = 20
+SHARE = 14
 
 
 def world(*gateways: str, seed: int = 1) -> tuple[World, list[Gateway]]:

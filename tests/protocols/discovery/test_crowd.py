@@ -120,6 +120,18 @@ def test_a_subscription_outlasts_its_lease_while_its_module_is_there_and_no_long
     assert not crowd.opened[4]
 
 
+def test_where_nothing_is_lost_one_other_module_is_enough() -> None:
+    discovery = Discovery("PC1", 99)
+    discovery.set_lossless()
+    discovery.advertise(0, "leds", 5)
+    discovery.link_up(0)
+    hear(discovery, 0, m.Hello("M1", 1, lease_ms=60_000, wire=m.WIRE_VERSION), m.Alive("M1", 0))
+    run(discovery, 0, 10 * S)
+    assert 1 <= offers(discovery, 10 * S, 52 * S) <= 2
+    hear(discovery, 52 * S, m.Alive("FW", 0))  # firmware behind a gateway needs its answers again and again
+    assert offers(discovery, 52 * S, 57 * S) >= 3
+
+
 def crowded(*, wire: int = m.WIRE_VERSION) -> Discovery:
     """One that knows five others on its link, and repeats a topic."""
     discovery = Discovery("PC1", 99)
