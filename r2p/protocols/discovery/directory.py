@@ -20,7 +20,7 @@ from r2p.protocols.discovery.schedule import CROWD, CROWD_ROUNDS, SLOW_ROUNDS
 from r2p.protocols.timers import KeyedTimers
 from r2p.units import MILLISECOND, SECOND
 
-TABLE_MAX = 4096
+TABLE_MAX = 16_384
 """Entries in each table."""
 
 LEASE = 5 * SECOND
@@ -480,6 +480,7 @@ class LeasedDemand(Demand):
         # None also before the HELLO of an r2p module: see `_start_leases`.
         lease = self._directory.lease_of(source)
         if not self.add(topic, role, source):
+            self._directory.counts["topics not forwarded"] += 1
             return
         if lease is not None:
             self._timers.set(("demand", topic, role, source), now + lease)

@@ -216,6 +216,7 @@ class TestHostile:
     def test_tables_are_bounded(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(directory, "TABLE_MAX", 10)
         discovery = started()
+        demand = discovery.demand()
         events: list[Event] = []
         for n in range(30):
             flood: list[m.Management] = [m.Hello(f"x{n}", n), m.Advertise(f"t{n}", 1), m.Endpoint(1, n, "n", f"t{n}")]
@@ -224,7 +225,8 @@ class TestHostile:
         assert "x29" in discovery.modules
         assert sum(isinstance(event, ModuleGone) for event in events) == 20
         assert discovery.counts["modules forgotten"] == 20
-        assert discovery.counts["topics forgotten"] == 20
+        assert discovery.counts["topics forgotten"] == discovery.counts["topics not forwarded"] == 20
+        assert len(demand.topics()) == 10
         run(discovery, S, 60 * S)
         assert not discovery.modules
         assert not discovery.endpoints
