@@ -13,10 +13,12 @@ from benchmarks.processes import process
 from benchmarks.table import Row
 from r2p.monitoring.monitor import NetworkMonitor
 from r2p.msg import Led
+from r2p.transports.zenoh import config
 
 MODULES, TOPICS = 20, 50  # of each module
 PERIOD = 1.0  # s, of each topic and of the monitor
 SETTLING, SECONDS = 8.0, 15.0
+_LEASE_MS = 20_000
 GOAL = 0.03  # of a core: that leaves room for a screen within the 5 % of `r2p top`
 
 
@@ -56,7 +58,13 @@ def _knows(router: r2p.Module, module: str) -> bool:
 
 
 def run_robot(pipe: Connection) -> None:
-    """Run 20 modules with 50 topics each, and send the port of their router."""
+    """Run 20 modules with 50 topics each, and send the port of their router.
+
+    All of them are in one process, which stands still for more than r2p's lease of 1 s when the machine is busy. Then
+    20 sessions would lose their connections, and each would announce all it has to all others, which takes so long that
+    they lose them again.
+    """
+    config._NEEDED["transport/link/tx/lease"] = _LEASE_MS  # noqa: SLF001 - users have no need of it
     run_on("uvloop", _robot(pipe))
 
 

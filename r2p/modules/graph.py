@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import functools
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -31,6 +31,8 @@ from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.link import Link
 from r2p.units import SECOND
 from r2p.version import __version__
+
+T = TypeVar("T")
 
 _CLASSES = tuple(PublisherClass(number or 1) for number in range(4))
 
@@ -140,10 +142,17 @@ class NetworkView:
 
         Raises Error if there is no such module, or it can't answer, and TimeoutError if it does not.
         """
+        return await self.read_statistics(module, decode)
+
+    async def read_statistics(self, module: str, read: Callable[[bytes], T]) -> T:
+        """Fetch the same, and return what `read` makes of the content of the answer, as `statistics.decode` does.
+
+        `read` may raise DecodeError, which becomes an Error as well.
+        """
         firmware = "it counts nothing that others can ask for"
         content = await self.ask(module, Operation.STATISTICS, COMPRESSED, what="statistics", firmware=firmware)
         try:
-            return decode(content)
+            return read(content)
         except DecodeError as error:
             raise Error(f"the answer of {module} is not what this version of r2p can read: {error}") from error
 
@@ -370,11 +379,15 @@ def _set_ages(views: dict[str, TopicView], space: TopicSpace) -> None:
             announced[topic.name] = now
     for link in space.links:
         link.discovery.refresh_ages(now)
-        for info in link.discovery.topics.values():
-            at = max(info.advertised_at or 0, info.requested_at or 0)
-            announced[info.name] = max(at, announced.get(info.name, 0))
+        for name, info in link.discovery.topics.items():
+            at, requested_at = info.advertised_at or 0, info.requested_at or 0
+            if requested_at > at:
+                at = requested_at
+            if at >= announced.get(name, 0):
+                announced[name] = at
     for name, view in views.items():
-        view.age = (now - announced[name]) / SECOND if name in announced else None
+        heard_at = announced.get(name)
+        view.age = None if heard_at is None else (now - heard_at) / SECOND
 
 
 def _facts(space: TopicSpace) -> dict[object, object]:

@@ -157,6 +157,11 @@ def encode(statistics: ModuleStatistics, argument: bytes = b"") -> bytes:
 
 def decode(data: bytes) -> ModuleStatistics:
     """Decode the content of an answer, of this version or a later one, compressed or not. Raises DecodeError."""
+    return layout(ModuleStatistics).decode(first_part(data))
+
+
+def first_part(data: bytes) -> bytes:
+    """Return the packed ModuleStatistics in the content of an answer, as `decode` takes it. Raises DecodeError."""
     if data.startswith(_ZLIB):
         data = _decompress(data)
     if len(data) < _HEAD.size:
@@ -164,7 +169,7 @@ def decode(data: bytes) -> ModuleStatistics:
     version, length = _HEAD.unpack_from(data)
     if version < VERSION or length > len(data) - _HEAD.size:
         raise DecodeError(f"statistics of version {version}, whose first part has {length} bytes")
-    return layout(ModuleStatistics).decode(data[_HEAD.size : _HEAD.size + length])
+    return data[_HEAD.size : _HEAD.size + length]
 
 
 def _decompress(data: bytes) -> bytes:

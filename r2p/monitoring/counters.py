@@ -5,6 +5,7 @@ goes back or is not a number only costs the rates.
 """
 
 import math
+import operator
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from typing import TypeVar
@@ -12,6 +13,7 @@ from typing import TypeVar
 import msgspec
 
 from r2p.log_lines import printable
+from r2p.messages import layout
 from r2p.modules.statistics import (
     LinkStatistics,
     ModuleStatistics,
@@ -20,6 +22,7 @@ from r2p.modules.statistics import (
     ServiceStatistics,
     SubscriberStatistics,
 )
+from r2p.monitoring.answers import AnswerNumbers, Columns, KnownAnswer
 from r2p.monitoring.rates import CounterRate
 from r2p.monitoring.snapshot import CLASS_NAMES, LinkFigures
 from r2p.names import node_alias, topic_alias
@@ -38,20 +41,45 @@ EndpointName = tuple[str, str]
 
 
 class PublisherCount(msgspec.Struct, eq=False):
-    """What a node has published on a topic. `rate` is known from the second answer on, before that None."""
+    """What a node has published on a topic. `rate` is known from the second answer on, before that None.
+
+    `changes` grows with each change of the other numbers, so one look says whether there was any.
+    """
 
     sent: int = 0
     missed: int = 0
     late: int = 0
     rate: float | None = None
     publisher_class: str | None = None
+    changes: int = 0
+
+    def enter(self, sent: int, missed: int, late: int, rate: float | None) -> None:
+        """Enter what its module says."""
+        if sent != self.sent or rate != self.rate or missed != self.missed or late != self.late:
+            self.sent, self.missed, self.late, self.rate = sent, missed, late, rate
+            self.changes += 1
 
 
 class SubscriberCount(msgspec.Struct, eq=False):
-    """What waits for a node in its subscription of a topic, and what that has lost, by reason."""
+    """What waits for a node in its subscription of a topic, and what that has lost, by reason; `changes` as above."""
 
     waiting: int = 0
     lost: Mapping[str, int] = _NONE
+    total: int = 0
+    """The sum of `lost`."""
+    changes: int = 0
+
+    def enter(self, waiting: int, lost: int, undecodable: int, too_long: int, stale: int) -> None:
+        """Enter what its module says."""
+        if undecodable or too_long or stale:
+            total = lost + undecodable + too_long + stale
+            reasons: Mapping[str, int] = _reasons_of(lost, undecodable, too_long, stale)
+        else:  # as it mostly is
+            total = lost
+            reasons = {"queue full": clamp(lost)} if lost else _NONE
+        if waiting != self.waiting or total != self.total or reasons != self.lost:
+            self.waiting, self.lost, self.total = waiting, reasons, total
+            self.changes += 1
 
 
 class ModuleCounters:
@@ -81,6 +109,8 @@ class ModuleCounters:
         """Messages that links, gateways and subscribers of the module have lost, by topic; only those with losses."""
         self.laxity: Mapping[str, float] = {}
         """The least time to a deadline (s) by topic."""
+        self._known: KnownAnswer | None = None
+        self._in_order = _EntriesInOrder()
         self._aliases: dict[EndpointName, EndpointName] = {}
         self._rates: dict[tuple[str, ...], CounterRate] = {}
         self._time: float | None = None
@@ -93,9 +123,23 @@ class ModuleCounters:
         self._rates.clear()
         self._time = None
         for each in self.publishers.values():
-            each.rate = None
+            each.enter(each.sent, each.missed, each.late, None)
         unknown = dict.fromkeys(("sent", "received", "bytes_sent", "bytes_received"))
         self.links = {key: msgspec.structs.replace(link, **unknown) for key, link in self.links.items()}
+
+    def read(self, module: str, part: bytes, room: int) -> None:
+        """Enter an answer as `update`, that of `statistics.first_part`. Raises DecodeError.
+
+        It is cheap where only numbers differ from the last one.
+        """
+        numbers = None if self._known is None or self.entries > room else self._known.read(part)
+        if numbers is not None and self._time is not None and self._time <= numbers.uptime < math.inf:
+            self._update_numbers(module, numbers)
+            return
+        self._known = None
+        statistics = layout(ModuleStatistics).decode(part)
+        self.update(module, statistics, room)
+        self._know(statistics, part)
 
     def update(self, module: str, statistics: ModuleStatistics, room: int) -> None:
         """Enter an answer, of which at most `room` entries are kept."""
@@ -107,7 +151,7 @@ class ModuleCounters:
             self._time = 0.0
         self.answers = True
         self.uptime = time if 0.0 <= time < math.inf else None
-        self._update_processor(statistics, restarted=restarted)
+        self._update_processor(time, statistics.cpu, restarted=restarted)
         limited = _Room(room)
         before, self._rates = self._rates, {}
         self._update_links(module, limited.take(statistics.links), before, time)
@@ -148,12 +192,54 @@ class ModuleCounters:
             self._aliases = {(node_alias(each), topic_alias(name)): (each, name) for each, name in known}
         return self._aliases.get((node_alias(node), topic_alias(topic)), ("", ""))
 
+    # An answer of which only numbers are new
+
+    def _know(self, statistics: ModuleStatistics, part: bytes) -> None:
+        """Note where the numbers of this answer are, unless entries were left out, or several have one name."""
+        counted = len(self.publishers), len(self.subscribers)
+        if self.left_out or counted != (len(statistics.publishers), len(statistics.subscribers)):
+            return
+        self._known = KnownAnswer(statistics, part)
+        self._in_order = _EntriesInOrder(
+            [*self.publishers.values()],
+            [self._rates[key] for key in self.publishers],
+            [*self.subscribers.values()],
+            [each.topic for each in statistics.topics],
+            [each.topic for each in statistics.forwarded],
+        )
+
+    def _update_numbers(self, module: str, numbers: AnswerNumbers) -> None:
+        """Enter an answer with the same entries as the one before."""
+        known, time = self._in_order, numbers.uptime
+        self.answers = self.has_rates = True
+        self.uptime = time
+        self._update_processor(time, numbers.cpu, restarted=False)
+        self._update_links(module, numbers.links, self._rates, time)
+        self.services = {(each.node, each.service): each for each in numbers.services}
+        sent, missed, late = numbers.publishers
+        totals = _clamped(sent), _clamped(missed), _clamped(late)
+        for count, rate, raw, of_sent, of_missed, of_late in zip(
+            known.publishers, known.rates, sent, *totals, strict=True
+        ):
+            count.enter(of_sent, of_missed, of_late, rate.add(time, raw))
+        if numbers.subscribers is not known.columns[0]:
+            for each, waiting, lost, undecodable, too_long, stale, _ in zip(
+                known.subscribers, *numbers.subscribers, strict=True
+            ):
+                each.enter(waiting, lost, undecodable, too_long, stale)
+        columns = numbers.subscribers, numbers.topics, numbers.forwarded
+        if not all(map(operator.is_, columns, known.columns)):
+            known.columns = columns
+            dropped = zip(known.forwarded, numbers.forwarded[1], strict=True)
+            self._sum_up(zip(known.topics, *numbers.topics, strict=True), dropped)
+        self._time = time
+
     # Parts of an answer
 
-    def _update_processor(self, statistics: ModuleStatistics, *, restarted: bool) -> None:
-        before, self._processor = 0.0 if restarted else self._processor, statistics.cpu
-        step = math.nan if self._time is None else statistics.uptime - self._time
-        share = (statistics.cpu - before) / step if step > 0.0 else math.nan
+    def _update_processor(self, uptime: float, cpu: float, *, restarted: bool) -> None:
+        before, self._processor = 0.0 if restarted else self._processor, cpu
+        step = math.nan if self._time is None else uptime - self._time
+        share = (cpu - before) / step if step > 0.0 else math.nan
         self.cpu = share if 0.0 <= share < math.inf else None
 
     def _rate(
@@ -176,8 +262,8 @@ class ModuleCounters:
         counts = {key: self.publishers.get(key) or PublisherCount() for key in sums}
         for key, each in sums.items():
             count = counts[key]
-            count.sent, count.missed, count.late = clamp(each.sent), clamp(each.missed), clamp(each.late)
-            count.rate = self._rate(key, time, each.sent, before)
+            rate = self._rate(key, time, each.sent, before)
+            count.enter(clamp(each.sent), clamp(each.missed), clamp(each.late), rate)
             count.publisher_class = _CLASS_NAMES.get(each.publisher_class)  # a later r2p may have others
         self._note_endpoints(self.publishers, counts)
         self.publishers = counts
@@ -187,9 +273,7 @@ class ModuleCounters:
         for each in entries:
             key = each.node, each.topic
             count = counts[key] = self.subscribers.get(key) or SubscriberCount()
-            count.waiting = each.waiting
-            has_lost = each.lost or each.undecodable or each.too_long or each.stale
-            count.lost = _subscriber_losses(each) if has_lost else _NONE
+            count.enter(each.waiting, each.lost, each.undecodable, each.too_long, each.stale)
         self._note_endpoints(self.subscribers, counts)
         self.subscribers = counts
 
@@ -219,21 +303,38 @@ class ModuleCounters:
             self.links[row.name] = row
 
     def _update_topics(self, statistics: ModuleStatistics, limited: "_Room") -> None:
+        topics = ((each.topic, each.lost, each.least_laxity) for each in limited.take(statistics.topics))
+        self._sum_up(topics, ((each.topic, each.dropped) for each in limited.take(statistics.forwarded)))
+
+    def _sum_up(self, topics: Iterable[tuple[str, int, float]], dropped: Iterable[tuple[str, int]]) -> None:
+        """Add up the losses of topics on links, in gateways and of subscribers, and find the least laxities."""
         lost: dict[str, int] = {}
         laxity: dict[str, float] = {}
-        for each in limited.take(statistics.topics):
-            if each.lost:
-                lost[each.topic] = lost.get(each.topic, 0) + each.lost
-            if math.isfinite(each.least_laxity):
-                least = each.least_laxity * _PER_SECOND
-                laxity[each.topic] = min(least, laxity.get(each.topic, math.inf))
-        for route in limited.take(statistics.forwarded):
-            if route.dropped:
-                lost[route.topic] = lost.get(route.topic, 0) + route.dropped
+        for topic, number, least in topics:
+            if number:
+                lost[topic] = lost.get(topic, 0) + number
+            if math.isfinite(least):
+                laxity[topic] = min(least * _PER_SECOND, laxity.get(topic, math.inf))
+        for topic, number in dropped:
+            if number:
+                lost[topic] = lost.get(topic, 0) + number
         for (_, topic), count in self.subscribers.items():
-            if count.lost:
-                lost[topic] = lost.get(topic, 0) + sum(count.lost.values())
+            if count.total:
+                lost[topic] = lost.get(topic, 0) + count.total
         self.lost, self.laxity = lost, laxity
+
+
+class _EntriesInOrder(msgspec.Struct, eq=False):
+    """What the entries of an answer are counted in, in their order, and the columns that were entered last."""
+
+    publishers: list[PublisherCount] = []
+    rates: list[CounterRate] = []
+    """Those of publishers."""
+    subscribers: list[SubscriberCount] = []
+    topics: list[str] = []
+    forwarded: list[str] = []
+    columns: tuple[Columns, ...] = ((), (), ())
+    """Those of subscribers, topics and forwarded topics."""
 
 
 class _Room:
@@ -265,17 +366,14 @@ def _sum(one: PublisherStatistics, other: PublisherStatistics) -> PublisherStati
     return PublisherStatistics(other.topic, other.node, other.publisher_class, *totals)
 
 
-def _subscriber_losses(each: SubscriberStatistics) -> Mapping[str, int]:
-    lost = {}
-    if each.lost:
-        lost["queue full"] = clamp(each.lost)
-    if each.undecodable:
-        lost["undecodable"] = clamp(each.undecodable)
-    if each.too_long:
-        lost["too long"] = clamp(each.too_long)
-    if each.stale:
-        lost["stale"] = clamp(each.stale)
-    return lost
+def _clamped(counts: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(map(clamp, counts)) if max(counts, default=0) > COUNT_MAX else counts
+
+
+def _reasons_of(lost: int, undecodable: int, too_long: int, stale: int) -> dict[str, int]:
+    """Return what a subscriber has lost, by reason."""
+    counts = {"queue full": lost, "undecodable": undecodable, "too long": too_long, "stale": stale}
+    return {reason: clamp(count) for reason, count in counts.items() if count}
 
 
 def _reasons(counts: Iterable[ReasonCount]) -> dict[str, int]:

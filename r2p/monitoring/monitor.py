@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import functools
-from collections.abc import Mapping
 from types import TracebackType
 from typing import Self
 
@@ -11,7 +10,7 @@ from r2p.errors import Closed, InvalidName
 from r2p.log_lines import get_logger
 from r2p.modules.graph import TopicLooks, TopicView
 from r2p.modules.module import Module
-from r2p.modules.statistics import ModuleStatistics
+from r2p.modules.statistics import ModuleStatistics, first_part
 from r2p.monitoring.buses import BusTables
 from r2p.monitoring.counters import ModuleCounters
 from r2p.monitoring.measuring import MeasuredTopic
@@ -70,12 +69,13 @@ class NetworkMonitor:
         self._sources = FigureSources(BusTables(module, self._node), self.types)
         self._type_names = TypeNames(self.types)
         self._looks = TopicLooks(module.network, module.space)
-        self._views: Mapping[str, TopicView] = {}
+        self._views: dict[str, TopicView] = {}
         self._topics = KnownTopics.of({})
-        self._topic_rows: list[tuple[TopicView, TopicRow]] = []
+        self._topic_rows: list[TopicRow] = []
         self._counted: object = None
         self._polling = StatisticsPolling(module, period)
         self._polls: dict[str, asyncio.Task[None]] = {}
+        self._entries = 0  # that are kept of all answers
         self._learning: asyncio.Task[None] | None = None
         self._is_early = True
         self._opened_at = 0
@@ -169,7 +169,7 @@ class NetworkMonitor:
         self._poll({view.name for view in modules if can_be_asked(view)})
         topics = self._look()
         sources.sum_up(topics.views)
-        self._learn(topics.views)
+        self._learn(topics)
         before = self.snapshot
         self.snapshot = NetworkSnapshot(
             time=self._clock.now(),
@@ -215,31 +215,27 @@ class NetworkMonitor:
         if counted != self._counted:
             self._counted = counted
             before = {row.name: row for row in self.snapshot.topics}
+            sources, types = self._sources, self._type_names
             self._topic_rows = [
-                (view, TopicRow(view, self._sources, before.get(name), is_of_service=name in topics.of_services))
+                TopicRow(view, sources, types, before.get(name), is_of_service=name in topics.of_services)
                 for name, view in topics.views.items()
             ]
         rows: list[TopicFigures] = []
-        for view, row in self._topic_rows:
-            rows.append(row.update(self._type_names.name(view)))
-            if len(rows) % _AT_ONCE == 0:
-                await asyncio.sleep(0)
+        for start in range(0, len(self._topic_rows), _AT_ONCE):
+            rows += [row.update() for row in self._topic_rows[start : start + _AT_ONCE]]
+            await asyncio.sleep(0)
         return rows
 
     # Types
 
-    def _learn(self, topics: Mapping[str, TopicView]) -> None:
+    def _learn(self, topics: KnownTopics) -> None:
         """Ask for types that are unknown, one after the other, unless that is being done."""
         if self._learning is not None and not self._learning.done():
             return
-        unknown = {
-            view.fingerprint: view.name
-            for view in topics.values()
-            if view.fingerprint is not None and not (view.ros_type or view.layout)
-            if self.types.by_fingerprint(view.fingerprint) is None
-        }
+        known = self.types.by_fingerprint
+        unknown = [topic for fingerprint, topic in topics.to_learn.items() if known(fingerprint) is None]
         if unknown:
-            finding = self._find_types(list(unknown.values()))
+            finding = self._find_types(unknown)
             self._learning = asyncio.create_task(finding, name=f"{self._module.name} finds types")
 
     async def _find_types(self, topics: list[str]) -> None:
@@ -254,14 +250,20 @@ class NetworkMonitor:
         ended = {name for name, task in self._polls.items() if task.done()}  # by an internal error: it begins anew
         for name in (self._polls.keys() - names) | ended:
             self._polls.pop(name).cancel()
-            del self._sources.counters[name]
+            self._entries -= self._sources.counters.pop(name).entries
         for name in sorted(names - self._polls.keys())[: _MODULES_MAX - len(self._polls)]:
             counters = self._sources.counters[name] = ModuleCounters()
             on_answer = functools.partial(self._answered, name, counters)
             asking = self._polling.run(name, on_answer, counters.silence)
             self._polls[name] = asyncio.create_task(asking, name=f"monitor asks {name}")
 
-    def _answered(self, name: str, counters: ModuleCounters, statistics: ModuleStatistics) -> None:
-        others = sum(each.entries for each in self._sources.counters.values() if each is not counters)
-        counters.update(name, statistics, _ENTRIES_MAX - others)
-        self._polling.period = max(self._period, (others + counters.entries) / _ENTRIES_PER_SECOND)
+    def _answered(self, name: str, counters: ModuleCounters, answer: ModuleStatistics | bytes) -> None:
+        others = self._entries - counters.entries
+        try:
+            if isinstance(answer, bytes):
+                counters.read(name, first_part(answer), _ENTRIES_MAX - others)
+            else:
+                counters.update(name, answer, _ENTRIES_MAX - others)
+        finally:
+            self._entries = others + counters.entries
+        self._polling.period = max(self._period, self._entries / _ENTRIES_PER_SECOND)

@@ -21,7 +21,7 @@ PERIOD = 1.0
 RETRY = 5.0
 """Seconds until a module that does not answer is asked again."""
 
-_NEAR_AT_ONCE = 4  # modules: together they answer as fast as a link takes answers
+_NEAR_AT_ONCE = 8  # modules: together they answer as fast as a link takes answers
 _REST = 1  # times as long as an answer took, nothing is asked ...
 _REST_SLOW = 200  # ... where links may be slow, whose capacity is for the robot ...
 _PERIOD_SLOW = 10.0  # s, ... but no longer than this, or than the former
@@ -77,14 +77,18 @@ class StatisticsPolling:
         self._turns = asyncio.Semaphore(_NEAR_AT_ONCE)
 
     async def run(
-        self, name: str, on_answer: Callable[[ModuleStatistics], None], on_silence: Callable[[str], None]
+        self, name: str, on_answer: Callable[[ModuleStatistics | bytes], None], on_silence: Callable[[str], None]
     ) -> None:
-        """Ask a module again and again, until cancelled; `on_silence` gets the reason of a failure."""
+        """Ask a module again and again, until cancelled.
+
+        `on_answer` gets the content of its answers, and this module's own statistics as they are. It may raise
+        DecodeError. `on_silence` gets the reason of a failure.
+        """
         pace = QuestionPace(self._module, name)
         is_first = True
         while True:
             try:
-                statistics = await self._ask(name, pace)
+                await self._ask(name, pace, on_answer)
             except Closed:
                 return
             except (Error, TimeoutError) as error:
@@ -92,15 +96,27 @@ class StatisticsPolling:
                 is_first = True
                 await pace.pause(RETRY)
             else:
-                on_answer(statistics)
-                await (pace.pause_first() if is_first else pace.pause(self.period))
+                await (pace.pause_first() if is_first else self._pause(pace))
                 is_first = False
 
-    async def _ask(self, name: str, pace: QuestionPace) -> ModuleStatistics:
+    async def _pause(self, pace: QuestionPace) -> None:
+        """Wait until a module may be asked again; all near ones at the same time, so this process wakes up once."""
+        period = self.period
+        if pace.is_near():
+            period = until_next(self._clock.monotonic() / SECOND, period)
+        await pace.pause(period)
+
+    async def _ask(self, name: str, pace: QuestionPace, on_answer: Callable[[ModuleStatistics | bytes], None]) -> None:
         if name == self._module.name:
-            return self._module.statistics()
+            on_answer(self._module.statistics())
+            return
         async with self._turns if pace.is_near() else contextlib.nullcontext():
             started = self._clock.monotonic()
-            statistics = await self._module.network.statistics(name)
+            await self._module.network.read_statistics(name, on_answer)
             pace.took = (self._clock.monotonic() - started) / SECOND
-            return statistics
+
+
+def until_next(now: float, period: float) -> float:
+    """Return the seconds from `now` until a multiple of the period: the first one that is at least half of one away."""
+    rest = period - now % period
+    return rest if rest >= period / 2 else rest + period

@@ -47,6 +47,8 @@ class KnownTopics(msgspec.Struct, frozen=True, eq=False):
     """The names of these topics."""
     nodes: Mapping[str, Mapping[str, NodeFigures]]
     """The nodes by module and name, and their topics."""
+    to_learn: Mapping[bytes, str]
+    """A topic of each type whose name is known by its fingerprint only."""
 
     @classmethod
     def of(cls, views: Mapping[str, TopicView], left_out: int = 0) -> Self:
@@ -58,7 +60,12 @@ class KnownTopics(msgspec.Struct, frozen=True, eq=False):
             if f"{base}{REQUESTS}" in views
         }
         of_services = {view.name for pair in services.values() for view in pair}
-        return cls(views, left_out, services, of_services, _nodes_by_module(views.values()))
+        to_learn = {
+            view.fingerprint: view.name
+            for view in views.values()
+            if view.fingerprint is not None and not (view.ros_type or view.layout)
+        }
+        return cls(views, left_out, services, of_services, _nodes_by_module(views.values()), to_learn)
 
 
 class FigureSources(msgspec.Struct, eq=False):
@@ -78,11 +85,12 @@ class FigureSources(msgspec.Struct, eq=False):
         """Add up the losses of all modules, and find the least laxities, by the names of topics on this network."""
         self.lost, self.laxity = {}, {}
         for module, counters in self.counters.items():
+            is_prefixed = "/" in module
             for topic, count in counters.lost.items():
-                name = network_name(module, topic, topics)
+                name = network_name(module, topic, topics) if is_prefixed or topic not in topics else topic
                 self.lost[name] = clamp(self.lost.get(name, 0) + count)
             for topic, laxity in counters.laxity.items():
-                name = network_name(module, topic, topics)
+                name = network_name(module, topic, topics) if is_prefixed or topic not in topics else topic
                 self.laxity[name] = min(laxity, self.laxity.get(name, laxity))
 
     def endpoint_revisions(self) -> list[tuple[ModuleCounters, int]]:
@@ -114,38 +122,57 @@ class TypeNames:
 
 
 class TopicRow:
-    """Makes the row of one topic, again and again: where its counts are is found out only once."""
+    """Makes the row of one topic, again and again: where its counts are is found out only once.
+
+    While none of the facts that it is made of has changed, nothing is made.
+    """
 
     __slots__ = (
         "_all_counted",
         "_any_counted",
         "_counted",
+        "_facts",
         "_is_of_service",
+        "_publisher_figures",
         "_publishers",
         "_sources",
+        "_subscriber_counts",
         "_subscriber_figures",
         "_subscribers",
+        "_type_name",
+        "_types",
         "_view",
         "row",
     )
 
     def __init__(
-        self, view: TopicView, sources: FigureSources, row: TopicFigures | None, *, is_of_service: bool
+        self,
+        view: TopicView,
+        sources: FigureSources,
+        types: "TypeNames",
+        row: TopicFigures | None,
+        *,
+        is_of_service: bool,
     ) -> None:
         """`row` is the last one that was made of the topic, if any was."""
         self.row = row
         self._view = view
         self._sources = sources
+        self._types = types
+        self._type_name: str | None = None
         self._is_of_service = is_of_service
+        self._facts: tuple[Any, ...] = (None, None)
         self._publishers = [(each, _class_name(each), self._publisher_count(each)) for each in view.publishers]
         self._subscribers = [(each, self._subscriber_count(each)) for each in view.subscribers]
-        self._subscriber_figures = [_subscriber(*each) for each in self._subscribers]
+        self._subscriber_counts = [count for _, count in self._subscribers if count is not None]
+        self._publisher_figures: list[PublisherFigures] = []
+        self._subscriber_figures: list[SubscriberFigures] = []
         # One of each node, however many links it is seen on; and firmware, which does not say which node it is.
         counts = {(each.module, each.node): count for each, _, count in self._publishers}
         self._counted = [count for count in counts.values() if count is not None]
         is_anonymous = not {each.link for each in view.publishers}.issuperset(view.published_on)
         self._all_counted = len(self._counted) == len(counts) > 0 and not is_anonymous
-        self._any_counted = bool(self._counted) or any(count is not None for _, count in self._subscribers)
+        self._any_counted = bool(self._counted or self._subscriber_counts)
 
     def _publisher_count(self, endpoint: Endpoint) -> PublisherCount | None:
         counters = self._sources.counters.get(endpoint.module)
@@ -155,62 +182,92 @@ class TopicRow:
         counters = self._sources.counters.get(endpoint.module)
         return None if counters is None else counters.subscriber(endpoint.module, endpoint.node, self._view.name)
 
-    def update(self, type_name: str | None) -> TopicFigures:
+    def update(self) -> TopicFigures:
         """Return the figures of now; if they are equal to the last ones, these."""
-        row = self._make(type_name)
-        if self.row is None or self.row != row:
-            self.row = row
+        sources, name, age = self._sources, self._view.name, self._view.age
+        if self._type_name is None:
+            self._type_name = self._types.name(self._view)
+        published = subscribed = 0
+        for publisher in self._counted:
+            published += publisher.changes
+        for subscriber in self._subscriber_counts:
+            subscribed += subscriber.changes
+        measured = sources.measured.get(name)
+        facts = (
+            published,
+            subscribed,
+            self._type_name,
+            None if age is None else age // _AGE_STEP * _AGE_STEP,
+            sources.lost.get(name, 0),
+            sources.laxity.get(name),
+            sources.buses.frames.get(name),
+            measured is None,
+        )
+        if self.row is None or measured is not None or facts != self._facts:
+            if facts[0] != self._facts[0]:
+                self._publisher_figures = [_publisher(*each) for each in self._publishers]
+            if facts[1] != self._facts[1]:
+                self._subscriber_figures = [_subscriber(*each) for each in self._subscribers]
+            self._facts = facts
+            row = self._make(measured, *facts[2:6])
+            if self.row != row:
+                self.row = row
         return self.row
 
-    def _make(self, type_name: str | None) -> TopicFigures:
-        view, sources, name = self._view, self._sources, self._view.name
+    def _make(
+        self, measured: MeasuredTopic | None, type_name: str | None, age: float | None, lost: int, laxity: float | None
+    ) -> TopicFigures:
+        view, counted = self._view, self._counted
+        missed: int | None = None
+        late: int | None = None
+        if len(counted) == 1:  # as almost all topics have
+            missed, late = counted[0].missed, counted[0].late
+        elif counted:
+            missed = clamp(sum([each.missed for each in counted]))
+            late = clamp(sum([each.late for each in counted]))
+        rate, source = self._rate(measured)
         figures = TopicFigures(
-            name,
+            view.name,
             type_name,
             view.size or None,
             view.varies,
             view.mismatch,
-            None if view.age is None else view.age // _AGE_STEP * _AGE_STEP,
-            [_publisher(*each) for each in self._publishers],
-            self._newest_subscribers(),
-            laxity=sources.laxity.get(name),
+            age,
+            self._publisher_figures,
+            self._subscriber_figures,
+            rate,
+            source,
+            rate * view.size if rate is not None and view.size and not view.varies else None,
+            laxity,
+            missed=missed,
+            late=late,
+            lost_on_way=lost if self._any_counted else None,
             is_of_service=self._is_of_service,
         )
-        if len(self._counted) == 1:  # as almost all topics have
-            figures.missed, figures.late = self._counted[0].missed, self._counted[0].late
-        elif self._counted:
-            figures.missed = clamp(sum([each.missed for each in self._counted]))
-            figures.late = clamp(sum([each.late for each in self._counted]))
-        if self._any_counted:
-            figures.lost_on_way = sources.lost.get(name, 0)
-        measured = sources.measured.get(name)
         if measured is not None:
             _enter_measured(figures, measured)
-        self._enter_rate(figures, measured)
         return figures
 
-    def _newest_subscribers(self) -> list[SubscriberFigures]:
-        """Return the figures of subscribers: the same list as before, if nothing has changed."""
-        for (_, count), known in zip(self._subscribers, self._subscriber_figures, strict=True):
-            if count is not None and (count.waiting != known.waiting or count.lost != known.lost):
-                self._subscriber_figures = [_subscriber(*each) for each in self._subscribers]
-                break
-        return self._subscriber_figures
+    def _rate(self, measured: MeasuredTopic | None) -> tuple[float | None, str | None]:
+        """Return the rate, by the best of its sources, and which one that is."""
+        rate = self._counted_rate()
+        if rate is not None:
+            return rate, "counters"
+        rate = self._rate_on_bus()
+        if rate is not None:
+            return rate, "bus"
+        if measured is not None and measured.rate is not None:
+            return measured.rate, "measured"
+        return None, None
 
-    def _enter_rate(self, figures: TopicFigures, measured: MeasuredTopic | None) -> None:
-        """Enter the rate, by the best of its sources, and the bandwidth."""
-        view = self._view
-        rates = [each.rate for each in self._counted if each.rate is not None] if self._all_counted else []
-        if rates and len(rates) == len(self._counted):
-            figures.rate, figures.rate_source = sum(rates), "counters"
-        elif (rate := self._rate_on_bus()) is not None:
-            figures.rate, figures.rate_source = rate, "bus"
-        elif measured is not None and measured.rate is not None:
-            figures.rate, figures.rate_source = measured.rate, "measured"
-        if view.size and not view.varies and figures.rate is not None:
-            figures.bandwidth = figures.rate * view.size
-        elif measured is not None:
-            figures.bandwidth = measured.bandwidth
+    def _counted_rate(self) -> float | None:
+        """Return the rates of all publishers together; None where one of them is unknown."""
+        if not self._all_counted:
+            return None
+        if len(self._counted) == 1:
+            return self._counted[0].rate
+        rates = [each.rate for each in self._counted if each.rate is not None]
+        return sum(rates) if len(rates) == len(self._counted) else None
 
     def _rate_on_bus(self) -> float | None:
         frames = self._sources.buses.frames.get(self._view.name)
@@ -241,6 +298,8 @@ def _subscriber(each: Endpoint, count: SubscriberCount | None) -> SubscriberFigu
 
 def _enter_measured(figures: TopicFigures, measured: MeasuredTopic) -> None:
     figures.measured = True
+    if figures.bandwidth is None:
+        figures.bandwidth = measured.bandwidth
     figures.latency = measured.latency
     figures.lost_here = clamp(measured.lost_here)
     gaps = measured.lost_on_way

@@ -82,6 +82,7 @@ async def test_what_is_measured_is_exact_rate_bytes_latency_and_losses() -> None
             await asyncio.sleep(0.01)
         network.loss = 0.0
         await publisher.publish(String())
+        await asyncio.sleep(0.1)  # for as long as it is on the way
         await figures(monitor, lambda snapshot: topic(snapshot, "pose").latency)
         received = pc.links[0].stats.received - received
         found = topic(monitor.snapshot, "pose")
@@ -153,6 +154,27 @@ async def test_a_module_that_restarts_and_a_publisher_that_comes_anew_keep_true_
             await figures(monitor, lambda each: not _module(each, "ARM").state)
         assert all(each.rate is None for each in monitor.snapshot.topics)
         assert {each.module for each in monitor.snapshot.links} == {"PC"}
+
+
+async def test_modules_on_fast_links_are_asked_at_the_same_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, list[float]] = {}
+    network = Network()
+    async with (
+        network.module("ARM"),
+        network.module("HAND"),
+        network.module("PC", observer=True) as pc,
+        NetworkMonitor(pc),
+    ):
+        read = pc.network.read_statistics
+
+        def noted(module: str, entering: Any) -> Any:
+            asked.setdefault(module, []).append(asyncio.get_running_loop().time())
+            return read(module, entering)
+
+        monkeypatch.setattr(pc.network, "read_statistics", noted)
+        await asyncio.sleep(10.0)
+    assert asked["ARM"][-5:] == pytest.approx(asked["HAND"][-5:], abs=1e-3)
+    assert len(asked["ARM"]) in (9, 10, 11)
 
 
 async def _grip(request: Led) -> Led:

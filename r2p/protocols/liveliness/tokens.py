@@ -267,8 +267,12 @@ class Matching:
 
     def mark_heard(self, now: int) -> None:
         """Mark what has a token as heard now."""
-        for topic, role in self._sessions_of:
-            self.topics[topic].set_heard(role, now)
+        topics = self.topics
+        for topic, role in self._sessions_of:  # a thousand, or more, for each look at the network
+            if role == ROLE_PUBLISHES:
+                topics[topic].advertised_at = now
+            else:
+                topics[topic].requested_at = now
 
     def _match(self, number: int, session: _PeerSession, key: TopicRole) -> None:
         topic, role = key

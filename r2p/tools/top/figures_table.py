@@ -70,6 +70,8 @@ class FiguresTable(Widget, can_focus=True):
         self._first_row = 0
         self._first_column = 1  # behind the name
         self._lines: list[_Line] = []
+        self._styles: dict[tuple[int, bool], Style] = {}
+        """Those of the lines that were drawn last, by alarm and cursor."""
 
     # What it shows
 
@@ -101,6 +103,7 @@ class FiguresTable(Widget, can_focus=True):
         """Draw the lines that differ from those on the screen."""
         self._cursor = max(0, min(self._cursor, len(self._rows) - 1))
         self._scroll()
+        self._styles.clear()
         lines, before = self._made_lines(), self._lines
         self._lines = lines
         changed = [i for i, line in enumerate(lines) if i >= len(before) or before[i] != line]
@@ -159,8 +162,18 @@ class FiguresTable(Widget, can_focus=True):
     def render_line(self, y: int) -> Strip:
         """Return one line: called by Textual for those that were refreshed."""
         line = self._lines[y] if y < len(self._lines) else _Line("")
-        style = _HEAD if y == 0 else _STYLES[line.alarm] + (_CURSOR if line.is_cursor else Style())
-        return Strip([Segment(set_cell_size(line.text, self.size.width), self.rich_style + style)], self.size.width)
+        width = self.size.width
+        return Strip([Segment(set_cell_size(line.text, width), self._style_of(y, line))], width)
+
+    def _style_of(self, y: int, line: _Line) -> Style:
+        if y == 0:
+            return self.rich_style + _HEAD
+        key = line.alarm, line.is_cursor
+        style = self._styles.get(key)
+        if style is None:  # which is found out only once for all lines that are drawn together: it takes long
+            own = _STYLES[line.alarm] + (_CURSOR if line.is_cursor else Style())
+            style = self._styles[key] = self.rich_style + own
+        return style
 
     # Keys and mouse
 

@@ -136,13 +136,6 @@ def _topic_alarm(row: TopicFigures) -> int:
     return ALARM if row.mismatch else OK
 
 
-_Losses = tuple[int | None, int | None, int | None]
-
-
-def _losses(row: TopicFigures) -> _Losses:
-    return row.missed, row.lost_on_way, row.lost_here
-
-
 class RecentLosses:
     """Notes which topics have lost something of late: what a robot lost at its start must not be red for ever."""
 
@@ -153,7 +146,9 @@ class RecentLosses:
     def note(self, snapshot: NetworkSnapshot) -> None:
         """Compare the losses of all topics with those of the last snapshot, as far as they were known then."""
         before, self._rows = self._rows, {row.name: row for row in snapshot.topics}
-        grown = [name for name, row in self._rows.items() if _has_lost_more(before.get(name, row), row)]
+        # Most rows are the same object as before, as long as nothing of them has changed.
+        pairs = [(last, row) for name, row in self._rows.items() if (last := before.get(name, row)) is not row]
+        grown = [row.name for last, row in pairs if _has_lost_more(last, row)]
         self._until = {name: end for name, end in self._until.items() if end > snapshot.time}
         self._until |= dict.fromkeys(grown, snapshot.time + _RECENT)
 
@@ -163,12 +158,15 @@ class RecentLosses:
 
 
 def _has_lost_more(before: TopicFigures, row: TopicFigures) -> bool:
-    if before is row:  # as most of them are: a row that has not changed is the same object
-        return False
-    then, now = _losses(before), _losses(row)
-    return then != now and any(
-        old is not None and new is not None and new > old for old, new in zip(then, now, strict=True)
+    return (
+        _has_grown(before.lost_on_way, row.lost_on_way)
+        or _has_grown(before.missed, row.missed)
+        or _has_grown(before.lost_here, row.lost_here)
     )
+
+
+def _has_grown(before: int | None, now: int | None) -> bool:
+    return before is not None and now is not None and now > before
 
 
 def _topics(snapshot: NetworkSnapshot) -> list[TopicFigures]:
