@@ -3,6 +3,7 @@
 `tables` has the columns, of both. `app` is the screen, for which Textual is needed (the extra `ui`); `plain` prints.
 """
 
+import gc
 import importlib.util
 import sys
 from typing import Annotated, Literal
@@ -68,6 +69,7 @@ async def top(
         if _wants_screen(count=1 if once else count, format=format):
             from r2p.tools.top.app import TopApp  # only here: it takes a third of a second
 
+            gc.freeze()  # what is loaded stays: looking for garbage in it takes 20 ms, again and again
             await TopApp(
                 session, monitor, view=chosen, sorted_by=sort, wanted=filter, allow_control=allow_control
             ).run_async()
