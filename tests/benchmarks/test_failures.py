@@ -39,3 +39,11 @@ def test_the_page_has_the_results_of_the_present_cases(tmp_path: Path) -> None:
 def test_whatever_fails_the_others_have_slots_again_after_three_seconds() -> None:
     rows = time_page.load("failures", FailureRow)
     assert all(run.slotted for each in rows for run in each.runs)
+
+
+def test_foreign_syncs_are_reported_where_a_node_forges_them_and_nowhere_else() -> None:
+    rows = time_page.load("failures", FailureRow)
+    reported = {each.name: [run.notices.get("foreign syncs", 0) for run in each.runs] for each in rows}
+    forging = {"sync-off-grid", "sync-wrong-count", "sync-early", "sync-late"}
+    assert {name for name, counts in reported.items() if all(counts)} == forging
+    assert {name for name, counts in reported.items() if any(counts)} == forging
