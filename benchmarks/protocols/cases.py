@@ -42,6 +42,8 @@ PROTOCOLS: dict[str, type[ProtocolNetwork]] = {
 FAULTS = ("urgent babble", "low babble", "lost sync", "lost master")
 FAULT_AT = 0.2  # s after the measurement has begun
 BABBLE = 0.1  # s
+RESPONSES_MIN = 5000
+"""From so many responses on, the longest one in 1000 is given: five or more are longer."""
 WATCHED = 0.5  # s from the fault on, in which its effects count
 BABBLER = "3"
 """The node of the thesis's set that fails; its own messages do not count."""
@@ -89,7 +91,7 @@ class CaseFigures(msgspec.Struct, kw_only=True):
         if ordered:
             self.worst = ordered[-1] / 1000
             self.median = ordered[len(ordered) // 2] / 1000
-        if len(ordered) >= 1000:
+        if len(ordered) >= RESPONSES_MIN:
             self.p999 = ordered[int(len(ordered) * 0.999)] / 1000
         self.responses = []
         return self

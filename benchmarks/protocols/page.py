@@ -13,7 +13,7 @@ from benchmarks.protocols.message_sets import named_set
 from benchmarks.protocols.study import ERROR_RATES, SYNCLESS, StudyResults
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from benchmarks.protocols.cases import CaseFigures
 
@@ -21,6 +21,8 @@ _DOCS = Path(__file__).parents[2] / "docs"
 ASSETS = _DOCS / "assets" / "comparison"
 PAGE = _DOCS / "comparison.md"
 RESULTS = ASSETS / "results.json"
+_WITH_RESPONSES = "thesis-80"
+_SEPARATOR = " / "
 _MARKED = re.compile(r"(<!-- table: ([\w.-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
@@ -47,11 +49,15 @@ def tables(results: StudyResults) -> dict[str, list[str]]:
     made = {"sets": list(_sets(results))}
     for name in _names(results):
         made[name] = list(_columns(results, name))
-    for name in results.protocols[0].plan.with_errors:
-        made[f"errors-{name}"] = list(_errors(results, name))
-    made["loads"] = list(_loads(results, sporadic=None))
-    made["loads-events"] = list(_loads(results, sporadic=True))
-    made["faults"] = list(_faults(results))
+    if _WITH_RESPONSES in _names(results):
+        made["errors-thesis"] = list(_errors_of_thesis(results))
+    made["errors-periodic"] = list(_errors(results, sporadic=False))
+    made["errors-events"] = list(_errors(results, sporadic=True))
+    made["errors-loads"] = list(_loads(results, _missed, ERROR_RATES[-1]))
+    made["loads"] = list(_loads(results, _missed))
+    made["loads-events"] = list(_loads(results, lambda figures: _ms(figures.worst or None)))
+    made["faults-babble"] = list(_faults(results, FAULTS[:2]))
+    made["faults-master"] = list(_faults(results, FAULTS[2:]))
     made["added"] = list(_added(results))
     return {name: lines for name, lines in made.items() if len(lines) > 2}
 
@@ -61,10 +67,25 @@ def _names(results: StudyResults) -> list[str]:
 
 
 def _sets(results: StudyResults) -> Iterator[str]:
-    yield from _head("set", "kbit/s", "nodes", "periodic", "sporadic", "shortest period ms", "load %", "measured s")
+    yield from _head(
+        "set",
+        "kbit/s",
+        "nodes",
+        "periodic",
+        "sporadic",
+        "shortest period ms",
+        "load %",
+        "measured s",
+        "periodic values",
+        "events",
+        "with errors s",
+    )
+    plan = results.protocols[0].plan
     for name in _names(results):
         messages = named_set(name)
         periodic = [each for each in messages.messages if not each.sporadic]
+        judged = results.figures(results.protocols[0].protocol, name)
+        assert judged is not None
         yield _row(
             name,
             f"{messages.bitrate // 1000}",
@@ -73,86 +94,97 @@ def _sets(results: StudyResults) -> Iterator[str]:
             f"{len(messages.messages) - len(periodic)}",
             f"{min(each.period for each in periodic) / 1e6:g}",
             f"{100 * messages.load:.1f}",
-            f"{results.protocols[0].plan.sets[name]:g}",
+            f"{plan.sets[name]:g}",
+            f"{judged.periodic}",
+            f"{judged.sporadic}",
+            f"{plan.with_errors[name]:g}",
         )
 
 
 def _columns(results: StudyResults, name: str) -> Iterator[str]:
-    yield from _head(
-        "protocol",
-        "sync %",
-        "bus busy %",
-        "jitter, fastest us",
-        "jitter, any us",
-        "periodic missed %",
-        "without a slot",
-        "events: median ms",
-        "99.9 % ms",
-        "worst ms",
-        "events missed %",
-    )
-    for protocol, figures in _rows(results, name):
-        yield _row(
+    rows = list(_rows(results, name))
+    events = any(figures.sporadic for _, figures in rows)
+    unplaced = any(figures.unplaced for _, figures in rows)
+    head = ["protocol", "sync %", "bus busy %", "jitter, fastest us", "jitter, any us", "periodic missed %"]
+    head += ["without a slot"] if unplaced else []
+    head += ["events: median ms", "99.9 % ms", "worst ms", "events missed %"] if events else []
+    yield from _head(*head)
+    for protocol, figures in rows:
+        cells = [
             protocol,
             f"{100 * figures.sync:.1f}" if protocol not in SYNCLESS or figures.sync else "-",
             f"{100 * figures.busy:.1f}",
             f"{figures.jitter_fast:.0f}",
             f"{figures.jitter:.0f}",
             _share(figures.periodic_missed, figures.periodic),
-            f"{figures.unplaced}" if figures.unplaced else "",
-            _ms(figures.median),
-            _ms(figures.p999),
-            _ms(figures.worst or None),
-            _share(figures.sporadic_missed, figures.sporadic),
-        )
+        ]
+        if unplaced:
+            cells.append(f"{figures.unplaced}" if figures.unplaced else "")
+        if events:
+            cells += [_ms(figures.median), _ms(figures.p999), _ms(figures.worst or None)]
+            cells.append(_share(figures.sporadic_missed, figures.sporadic))
+        yield _row(*cells)
 
 
-def _errors(results: StudyResults, name: str) -> Iterator[str]:
-    kinds = ("periodic missed %", "events missed %", "jitter, any us")
-    yield from _head("protocol", *(f"{_rate(rate)}: {kind}" for kind in kinds for rate in ERROR_RATES))
-    for protocol, _ in _rows(results, name):
-        figures = [results.figures(protocol, name, rate) for rate in ERROR_RATES]
-        known = [each for each in figures if each is not None]
+def _errors_of_thesis(results: StudyResults) -> Iterator[str]:
+    """What else errors change on the thesis's network, where there are events enough."""
+    kinds = ("events 99.9 % ms", "events worst ms", "jitter us")
+    yield from _head("protocol", *(f"{kind}: {_rate(rate)}" for kind in kinds for rate in ERROR_RATES))
+    for each in results.protocols:
+        figures = [results.figures(each.protocol, _WITH_RESPONSES, rate) for rate in ERROR_RATES]
+        known = [one for one in figures if one is not None]
         yield _row(
-            protocol,
-            *(_share(each.periodic_missed, each.periodic) for each in known),
-            *(_share(each.sporadic_missed, each.sporadic) for each in known),
-            *(f"{each.jitter:.0f}" for each in known),
+            each.protocol,
+            *(_ms(one.p999) for one in known),
+            *(_ms(one.worst or None) for one in known),
+            *(f"{one.jitter:.0f}" for one in known),
         )
 
 
-def _loads(results: StudyResults, *, sporadic: bool | None) -> Iterator[str]:
+def _errors(results: StudyResults, *, sporadic: bool) -> Iterator[str]:
+    """What is missed with errors at each rate, by set, periodic messages or events."""
+    names = [
+        name for name in _names(results) if not sporadic or any(each.sporadic for each in named_set(name).messages)
+    ]
+    yield from _head("protocol", *names)
+    for each in results.protocols:
+        cells = []
+        for name in names:
+            figures = [results.figures(each.protocol, name, rate) for rate in ERROR_RATES]
+            shares = [
+                _share(one.sporadic_missed, one.sporadic) if sporadic else _share(one.periodic_missed, one.periodic)
+                for one in figures
+                if one is not None
+            ]
+            cells.append(_SEPARATOR.join(shares) if any(share != "0" for share in shares) else "0")
+        yield _row(each.protocol, *cells)
+
+
+def _loads(results: StudyResults, cell: Callable[[CaseFigures], str], bit_error_rate: float = 0.0) -> Iterator[str]:
     loads = results.protocols[0].plan.loads
     yield from _head("protocol", *(f"{load} %" for load in loads))
     for each in results.protocols:
-        figures = [results.figures(each.protocol, f"random-{load}") for load in loads]
-        if sporadic:
-            cells = [_ms(one.worst or None) if one else "" for one in figures]
-        else:
-            cells = [_missed(one) for one in figures]
-        yield _row(each.protocol, *cells)
+        figures = [results.figures(each.protocol, f"random-{load}", bit_error_rate) for load in loads]
+        yield _row(each.protocol, *("" if one is None else cell(one) for one in figures))
 
 
-def _missed(figures: CaseFigures | None) -> str:
-    if figures is None:
-        return ""
+def _missed(figures: CaseFigures) -> str:
     return _share(figures.periodic_missed + figures.sporadic_missed, figures.periodic + figures.sporadic)
 
 
-def _faults(results: StudyResults) -> Iterator[str]:
+def _faults(results: StudyResults, faults: Sequence[str]) -> Iterator[str]:
     kinds = ("periodic missed %", "events missed %", "longest silence ms")
-    yield from _head("protocol", *(f"{fault}: {kind}" for fault in FAULTS for kind in kinds))
+    yield from _head("protocol", *(f"{fault}: {kind}" for fault in faults for kind in kinds))
     for each in results.protocols:
         cells: list[str] = []
-        for fault in FAULTS:
+        for fault in faults:
             figures = results.figures(each.protocol, "thesis-80", 0.0, fault)
-            if figures is None:
-                cells += ["-"] * len(kinds)
-                continue
-            cells.append(_share(figures.periodic_missed, figures.periodic))
-            cells.append(_share(figures.sporadic_missed, figures.sporadic))
-            cells.append(f"{figures.silence / 1000:.1f}")
-        yield _row(each.protocol, *cells)
+            if figures is not None:
+                cells.append(_share(figures.periodic_missed, figures.periodic))
+                cells.append(_share(figures.sporadic_missed, figures.sporadic))
+                cells.append(f"{figures.silence / 1000:.1f}")
+        if cells:
+            yield _row(each.protocol, *cells)
 
 
 def _added(results: StudyResults) -> Iterator[str]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from benchmarks.protocols import page, pictures
-from benchmarks.protocols.cases import PROTOCOLS, StudyCase, merge, simulate
-from benchmarks.protocols.study import FULL
+from benchmarks.protocols.cases import PROTOCOLS, merge, simulate
+from benchmarks.protocols.study import FULL, cases_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,9 +35,21 @@ def test_the_pictures_are_those_of_the_results(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("protocol", "messages"), [("plain CAN, DM", "hyundai"), ("TTCAN", "vw"), ("CANopen", "table-4.1")]
+    ("protocol", "messages", "bit_error_rate"),
+    [
+        ("plain CAN, DM", "hyundai", 0.0),
+        ("TTCAN", "vw", 1e-5),
+        ("CANopen", "broster", 1e-4),
+        ("EDF in the identifier", "random-20", 1e-4),
+    ],
 )
-def test_a_row_of_the_results_comes_out_again(protocol: str, messages: str) -> None:
+def test_a_row_of_the_results_comes_out_again(protocol: str, messages: str, bit_error_rate: float) -> None:
     """A failure means that the bus or a policy has changed: run `python -m benchmarks.protocols --write` anew."""
-    case = StudyCase(protocol=protocol, messages=messages, duration=FULL.sets[messages])
-    assert merge([simulate(case)]) == page.load_results().figures(protocol, messages)
+    wanted = messages, bit_error_rate, ""
+    cases = next(
+        cases
+        for cases in cases_of(protocol, FULL)
+        if (cases[0].messages, cases[0].bit_error_rate, cases[0].fault) == wanted
+    )
+    figures = merge([simulate(case) for case in cases])
+    assert figures == page.load_results().figures(protocol, messages, bit_error_rate)
