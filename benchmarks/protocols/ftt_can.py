@@ -134,6 +134,7 @@ class FttCan(ProtocolNetwork):
         if number is None:
             box.open(begins, opens - GUARD // 2)
         elif flags >> number & 1:
+            box.clear()  # what an error has kept from the last window
             box.opens, box.closes = opens, closes
             box.put(box.track.release(box.controller.clock.true(opens)))
 

@@ -16,6 +16,7 @@ from benchmarks.protocols.cases import (
     merge,
     simulate,
 )
+from benchmarks.protocols.discovery import DiscoveryShare, discovery_share
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -40,6 +41,7 @@ class StudyPlan(msgspec.Struct, frozen=True):
     load_seeds: int = 2
     load_duration: float = 1.5
     fault_seeds: int = 3
+    discovery: bool = True
 
 
 FULL = StudyPlan(
@@ -67,7 +69,7 @@ FULL = StudyPlan(
     },
 )
 """Without errors, each set with events has more than 5000 of them; all but `ford` have 10 000."""
-QUICK = StudyPlan({"sae": 0.2}, {"sae": 0.1}, (20,), 1, 0.1, 1)
+QUICK = StudyPlan({"sae": 0.2}, {"sae": 0.1}, (20,), 1, 0.1, 1, discovery=False)
 
 
 class StudyRow(msgspec.Struct, frozen=True):
@@ -93,6 +95,8 @@ class StudyResults(msgspec.Struct):
     """All protocols, in the order of the tables."""
 
     protocols: list[ProtocolResults]
+    discovery: DiscoveryShare | None = None
+    """Of r2p modules with the topics of `thesis-80`."""
 
     def figures(self, protocol: str, messages: str, bit_error_rate: float = 0.0, fault: str = "") -> CaseFigures | None:
         """Return the figures of a case; None: it was not run."""
@@ -165,4 +169,7 @@ def run_study(
             found = run_protocol(protocol, plan, pool)
             file.write_bytes(msgspec.json.encode(found))
         results.protocols.append(found)
+    if plan.discovery:
+        show("running r2p modules")
+        results.discovery = pool.submit(discovery_share).result()
     return results

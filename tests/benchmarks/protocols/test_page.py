@@ -53,3 +53,11 @@ def test_a_row_of_the_results_comes_out_again(protocol: str, messages: str, bit_
     )
     figures = merge([simulate(case) for case in cases])
     assert figures == page.load_results().figures(protocol, messages, bit_error_rate)
+
+
+def test_the_page_says_what_discovery_takes() -> None:
+    found = page.load_results().discovery
+    assert found is not None
+    text = page.PAGE.read_text().replace("\n  ", " ")
+    assert f"use {found.bus:.1%} of the bus for management".replace("%", " %") in text
+    assert f"{found.free_slots:.0%} of the free slots".replace("%", " %") in text

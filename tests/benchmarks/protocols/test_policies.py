@@ -14,6 +14,7 @@ from benchmarks.protocols.message_sets import named_set, random_set
 from benchmarks.protocols.network import ProtocolSetup
 from benchmarks.protocols.ttcan import SoftwareTtcan, Ttcan
 from benchmarks.protocols.ttcan_matrix import CYCLES
+from r2p.codecs.can_bits import OtherFrame, wire_identifier
 from r2p.sim import run
 
 if TYPE_CHECKING:
@@ -75,6 +76,25 @@ def test_asynchronous_frames_of_ftt_can_keep_out_of_the_synchronous_window_and_o
                 assert not synchronous
 
     run(main)
+
+
+@pytest.mark.parametrize("errors", [1, 2, 3])
+def test_what_an_error_keeps_from_a_window_of_ftt_can_does_not_delay_the_next_values(errors: int) -> None:
+    async def main() -> int:
+        network = FttCan(ProtocolSetup(messages=named_set("table-4.1")))
+        network.start()
+        await network.ready()
+        rank = [each.name for each in network.set.by_deadline()].index("angle")  # two frames
+        network.bus.disturb_next(count=errors, identifier=wire_identifier(OtherFrame(0x10 + rank)))
+        await asyncio.sleep(0.03)
+        begin = network.bus.timeline.now()
+        await asyncio.sleep(0.1)
+        verdict = network.tracks["angle"].judge(begin, network.bus.timeline.now())
+        network.close()
+        assert verdict.count > 5
+        return verdict.missed
+
+    assert run(main) == 0
 
 
 @pytest.mark.parametrize("kind", [Ttcan, SoftwareTtcan])
