@@ -103,7 +103,9 @@ def _bars(rows: Sequence[tuple[str, float, float]], path: Path, title: str, limi
         right = min(max(math.log10(max(end, limits[0])), left + 0.01), high)
         plot.box((left, right), (place + 0.2, place + 0.8), colour)
         plot.note(low - 0.01 * (high - low), place + 0.38, name, anchor="end")
-        plot.note(min(right + 0.01 * (high - low), high - 0.1), place + 0.38, f"{end:.3g}")
+        plot.note(
+            min(right + 0.01 * (high - low), high - 0.1), place + 0.38, f"{end:.0f}" if end >= 100 else f"{end:.3g}"
+        )
     plot.write(path)
 
 
