@@ -72,9 +72,16 @@ class _Question(msgspec.Struct, eq=False):
     header: ServiceHeader
     operation: int
     page: int
-    answer: "asyncio.Future[OwnCall]"
+    answer: OwnCall | None = None
     working_at: float = 0.0
     """The time at which the module has said last that it works on the request (s of the loop)."""
+    turn: "asyncio.Future[None] | None" = None
+    """Done when the answer comes, or when it is time to repeat the request."""
+
+    def end_turn(self) -> None:
+        """Wake up what waits for the answer."""
+        if self.turn is not None and not self.turn.done():
+            self.turn.set_result(None)
 
     def is_answered_by(self, call: OwnCall) -> bool:
         same = (call.header.number, call.header.server) == (self.header.number, self.header.server)
@@ -203,36 +210,42 @@ class OwnServices:
     ) -> OwnCall:
         """Send a request, again and again, until it is answered. Raises TimeoutError."""
         header = ServiceHeader(self._instance, self._next_number(), Kind.REQUEST, instance)
-        question = _Question(header, operation, page, self._space.loop.create_future())
+        question = _Question(header, operation, page)
         nearest = self._nearest(instance)
         at_once = 0 if nearest is None or nearest[1].hops else _pages_at_once(nearest[0])
         request = own_services.encode(OwnCall(header, operation, page, at_once, edition, argument))
         self._questions[header.number] = question
         try:
-            await self._repeat(request, question)
+            return await self._repeat(request, question)
         finally:
             del self._questions[header.number]
-        return question.answer.result()
 
-    async def _repeat(self, request: bytes, question: _Question) -> None:
-        start, pause, patience = self._space.loop.time(), _FIRST_PAUSE, _PATIENCE
+    async def _repeat(self, request: bytes, question: _Question) -> OwnCall:
+        loop = self._space.loop
+        start, pause, patience = loop.time(), _FIRST_PAUSE, _PATIENCE
         works = 0.0
-        while not question.answer.done():
+        while question.answer is None:
             nearest = self._nearest(question.header.server)
             if nearest is not None:
                 link, info = nearest
                 slow = link.calls.duration
                 patience = (_PATIENCE_BEHIND if info.hops else _PATIENCE) + _SLOW * slow + works
                 pause = max(pause, 2 * slow)
-            left = start + patience - self._space.loop.time()
+            left = start + patience - loop.time()
             if left < _SHORTEST_PAUSE:
                 raise TimeoutError("no answer")
+            question.turn = loop.create_future()
             if nearest is not None:
                 link.calls.send(request, info.source)
-            await asyncio.wait([question.answer], timeout=min(pause, left))
+            timer = loop.call_later(min(pause, left), question.end_turn)  # asyncio.wait takes longer
+            try:
+                await question.turn
+            finally:
+                timer.cancel()
             pause *= _GROWTH
             if question.working_at > start:
                 start, pause, works = question.working_at, _WORKING_PAUSE, _WORKING_PATIENCE
+        return question.answer
 
     def _nearest(self, instance: int) -> tuple[Link, ModuleInfo] | None:
         """Return the link by which a module is reached now, and the module as it is known there."""
@@ -286,11 +299,12 @@ class OwnServices:
                 link.calls.send(answer, source)
         elif not call.is_request:
             question = self._questions.get(call.header.number)
-            if question is not None and question.is_answered_by(call) and not question.answer.done():
+            if question is not None and question.is_answered_by(call) and question.answer is None:
                 if call.header.kind is Kind.WORKING:
                     question.working_at = self._space.loop.time()
                 else:
-                    question.answer.set_result(call)
+                    question.answer = call
+                    question.end_turn()
 
     def _answer(self, link: Link, call: OwnCall, source: Hashable) -> bytes | None:
         """Return the answer to a request, the same for each repetition of it; None: a handler begins to work on it."""

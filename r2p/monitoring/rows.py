@@ -83,15 +83,17 @@ class FigureSources(msgspec.Struct, eq=False):
 
     def sum_up(self, topics: Mapping[str, TopicView]) -> None:
         """Add up the losses of all modules, and find the least laxities, by the names of topics on this network."""
-        self.lost, self.laxity = {}, {}
+        lost: dict[str, int] = {}
+        laxities: dict[str, float] = {}
+        self.lost, self.laxity = lost, laxities
         for module, counters in self.counters.items():
             is_prefixed = "/" in module
             for topic, count in counters.lost.items():
                 name = network_name(module, topic, topics) if is_prefixed or topic not in topics else topic
-                self.lost[name] = clamp(self.lost.get(name, 0) + count)
+                lost[name] = clamp(lost.get(name, 0) + count)
             for topic, laxity in counters.laxity.items():
                 name = network_name(module, topic, topics) if is_prefixed or topic not in topics else topic
-                self.laxity[name] = min(laxity, self.laxity.get(name, laxity))
+                laxities[name] = min(laxity, laxities.get(name, laxity))
 
     def endpoint_revisions(self) -> list[tuple[ModuleCounters, int]]:
         """Return what is equal for as long as the modules have counts of the same publishers and subscribers."""
