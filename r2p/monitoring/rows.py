@@ -167,8 +167,9 @@ class TopicRow:
         self._publishers = [(each, _class_name(each), self._publisher_count(each)) for each in view.publishers]
         self._subscribers = [(each, self._subscriber_count(each)) for each in view.subscribers]
         self._subscriber_counts = [count for _, count in self._subscribers if count is not None]
-        self._publisher_figures: list[PublisherFigures] = []
-        self._subscriber_figures: list[SubscriberFigures] = []
+        # Tuples, of which the garbage collector soon finds that there is nothing to collect: lists it looks at again.
+        self._publisher_figures: tuple[PublisherFigures, ...] = ()
+        self._subscriber_figures: tuple[SubscriberFigures, ...] = ()
         # One of each node, however many links it is seen on; and firmware, which does not say which node it is.
         counts = {(each.module, each.node): count for each, _, count in self._publishers}
         self._counted = [count for count in counts.values() if count is not None]
@@ -207,9 +208,9 @@ class TopicRow:
         )
         if self.row is None or measured is not None or facts != self._facts:
             if facts[0] != self._facts[0]:
-                self._publisher_figures = [_publisher(*each) for each in self._publishers]
+                self._publisher_figures = tuple([_publisher(*each) for each in self._publishers])
             if facts[1] != self._facts[1]:
-                self._subscriber_figures = [_subscriber(*each) for each in self._subscribers]
+                self._subscriber_figures = tuple([_subscriber(*each) for each in self._subscribers])
             self._facts = facts
             row = self._make(measured, *facts[2:6])
             if self.row != row:

@@ -70,8 +70,8 @@ class TopicFigures(Figures):
     varies: bool = False
     mismatch: bool = False
     age: float | None = None
-    publishers: list[PublisherFigures] = msgspec.field(default_factory=list)
-    subscribers: list[SubscriberFigures] = msgspec.field(default_factory=list)
+    publishers: tuple[PublisherFigures, ...] = ()
+    subscribers: tuple[SubscriberFigures, ...] = ()
     rate: float | None = None
     rate_source: str | None = None
     bandwidth: float | None = None

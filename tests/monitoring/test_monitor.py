@@ -302,7 +302,7 @@ async def test_firmware_says_nothing_of_its_rates() -> None:
         firmware.advertise("imu", 24)
         snapshot = await figures(monitor, lambda each: len(each.modules) > 1)
         imu = topic(snapshot, "imu")
-        assert (imu.size, imu.rate, imu.publishers, imu.age) == (24, None, [], 0.0)
+        assert (imu.size, imu.rate, imu.publishers, imu.age) == (24, None, (), 0.0)
         assert _module(snapshot, "IMU").answers is None
         monitor.measure("imu")
         await monitor.changed()

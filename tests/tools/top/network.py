@@ -45,7 +45,7 @@ def network(*, seconds: int = 0, missed: int = 0, **others: Any) -> NetworkSnaps
         ],
         "topics": [
             topic("encoder1", rate=1000.0, rate_source="bus", laxity=0.0015, late=0),
-            topic("odometry", rate=100.0, publishers=[publisher], missed=missed, lost_on_way=0),
+            topic("odometry", rate=100.0, publishers=(publisher,), missed=missed, lost_on_way=0),
             topic("reset_q", is_of_service=True),
             topic(
                 "scan", size=1500, varies=True, latency=LatencyFigures(0.0004, 0.0021, 50), lost_here=7, measured=True
