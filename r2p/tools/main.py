@@ -53,13 +53,14 @@ _COMPLETION_VARIABLE = "_R2P_COMPLETE"  # what a shell asks for, and for which s
 _COMPLETION_OPTIONS = ("--install-completion", "--show-completion")
 _SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
 
-_PYDANTIC = {
-    r"^Value error, ": "",
-    r"Input should be a valid integer.*": "write a whole number",
-    r"Input should be greater than or equal to (\S+)": r"write a number of at least \1",
-    r"Input should be less than or equal to (\S+)": r"write a number of at most \1",
+_TEXTS = {
+    r"'.*' is not a valid int(eger| range)\.": "write a whole number",
+    r"'.*' is not a valid float( range)?\.": "write a number",
+    r"\S+ is not in the range x>=(\S+)\.": r"write a number of at least \1",
+    r"\S+ is not in the range x<=(\S+)\.": r"write a number of at most \1",
+    r"\S+ is not in the range (\S+)<=x<=(\S+)\.": r"write a number from \1 to \2",
 }
-"""Texts of pydantic, which checks values for Typer, as patterns, and what r2p says instead."""
+"""Texts of Typer about values, as patterns, and what r2p says instead."""
 
 LAUNCHER_VARIABLE = "R2P_LAUNCHER"
 """The environment variable by which `r2p launch` gives its process id to the commands that it starts."""
@@ -83,14 +84,14 @@ class LazyGroup(TyperGroup):
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            error.message = _without_pydantic(error.message)
+            error.message = _plain(error.message)
             error.message = _wrapped_behind(f"Error: {error.format_message()}", error.message)
             raise
 
 
-def _without_pydantic(text: str) -> str:
+def _plain(text: str) -> str:
     """Return what is wrong with a value, in r2p's words."""
-    for pattern, plain in _PYDANTIC.items():
+    for pattern, plain in _TEXTS.items():
         text = re.sub(pattern, plain, text)
     return text
 

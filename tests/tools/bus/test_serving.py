@@ -153,7 +153,7 @@ def test_an_emulated_robot_lets_others_join_its_bus() -> None:
         (["a/b"], "a bus can't be served as 'a/b'"),
         ([".."], "a bus can't be served as '..'"),
         (["lab", "--bitrate", "300000"], "at 300000 bit/s a bit does not take whole nanoseconds: take"),
-        (["lab", "--noise", "2"], "less than or equal to 1"),
+        (["lab", "--noise", "2"], "0.0<=x<=1.0"),
     ],
 )
 def test_mistakes(arguments: list[str], text: str) -> None:
