@@ -30,7 +30,7 @@ CROWD_ROUNDS = 14
 """The most turns of the ring in which the slow ring turns once, reached with as many modules."""
 _PRESENCE_MODULES = 30
 _PRESENCE_MAX = 10
-"""For each so many modules, presences are a round apart, up to so many rounds."""
+"""For each so many modules, a round takes as long as another one, up to so many."""
 _PRESENCE_INTERVAL = SECOND // 10
 """Ns between two presences (HELLO and ALIVE), at least, however many modules ask."""
 _PRESENCE_EACH = SECOND // 100
@@ -44,6 +44,8 @@ _ITEM_MESSAGES = 2
 _NEWCOMER_EACH = SECOND // 20
 """Ns for each module on the link between two full repetitions for new modules. Those that start meanwhile share one, so
 that the start of n modules costs each a few repetitions, not n."""
+_NEWCOMER_MAX = 10 * SECOND
+"""The same, at most."""
 _TOOL_INTERVAL = SECOND // 5
 """Ns between two full repetitions for a tool, whose user is waiting."""
 
@@ -190,11 +192,9 @@ class Schedule:
         apart = max(_PRESENCE_INTERVAL, _PRESENCE_SHARE * self._bucket.gap, modules * _PRESENCE_EACH)
         self._presence_at = min(self._presence_at, max(now, self._presence_sent + apart))
         apart = modules * _NEWCOMER_EACH
-        at = self._repeated_at + min(apart, _TOOL_INTERVAL if tool else _ROUND)
+        at = self._repeated_at + min(apart, _TOOL_INTERVAL if tool else _NEWCOMER_MAX)
         if at <= now:
             self._repeat(now)
-        elif apart >= _ROUND and not tool:
-            self._include_slow()  # the next turn is soon enough
         elif not self._tool_waits:  # a time that suits a tool is the earlier one, so it stays
             self._repeat_at, self._tool_waits = at, tool
 
@@ -267,14 +267,19 @@ class Schedule:
         if not self._crowd:
             return min(_STEP, _ROUND // (self._places + 1))
         share = self._rounds * (self._count - len(self._slow)) + len(self._slow)
-        return _ROUND * self._rounds // max(1, share)
+        return self._crowd_round * self._rounds // max(1, share)
 
     @property
     def _presence_period(self) -> int:
         period = min(_ROUND, _STEP * (self._places + 1))
         if self._crowd:
-            period = _ROUND * min(max(1, self._crowd // _PRESENCE_MODULES), _PRESENCE_MAX)
+            period = self._crowd_round
         return max(period, _PRESENCE_SHARE * self._bucket.gap)
+
+    @property
+    def _crowd_round(self) -> int:
+        """Ns in which a module of a crowd repeats its presence, and what it says in every round."""
+        return _ROUND * min(max(1, self._crowd // _PRESENCE_MODULES), _PRESENCE_MAX)
 
     def _repeat(self, now: int) -> None:
         self._repeated_at, self._repeat_at, self._tool_waits = now, None, False

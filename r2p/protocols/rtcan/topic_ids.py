@@ -18,7 +18,7 @@ from r2p.codecs import rtcan
 from r2p.units import LONG_AGO, SECOND
 
 _COUNT = rtcan.HIGH_MAX + 1 - rtcan.FIRST_TOPIC
-_LEASE = 100 * SECOND  # at least: three turns of the slow ring in a crowd
+_LEASE = 300 * SECOND  # at least: two turns of the slow ring in the largest crowd that a bus can have
 _ROUNDS = 2  # that may be missed on a slow bus
 _MESSAGES = 2  # of one topic in a round: its type and its ADVERTISE
 K = TypeVar("K")
