@@ -118,7 +118,7 @@ async def test_versions_are_listed_also_behind_a_gateway(
         assert rows == {"ARM": (r2p.__version__, 3), "GW": (r2p.__version__, 3), "NEW": ("9.9", 9)}
         monkeypatch.setattr("sys.stdout.isatty", lambda: True)
         await list_(session)
-        assert re.search(r"NEW +running +False +r2p +9.9 +9, not 2 ", capsys.readouterr().out)
+        assert re.search(r"NEW +running +False +r2p +9.9 +9, not 3 ", capsys.readouterr().out)
 
 
 async def test_ages_have_a_unit_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,7 @@ from tests.transports.test_conformance import until
 
 pytestmark = pytest.mark.anyio
 
-SOAK = int(os.environ.get("R2P_SOAK", "2000"))
+SOAK = int(os.environ.get("R2P_SOAK", "600"))
 """Connects and disconnects of a client."""
 SUBSCRIBE = manage(m.SubscribeRequest("leds", 5, 1, m.UNANSWERED))
 
