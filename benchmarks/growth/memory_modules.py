@@ -7,7 +7,7 @@ from multiprocessing.connection import Connection
 
 import r2p
 from benchmarks.growth.curve import Curve
-from benchmarks.growth.zenoh_modules import counts
+from benchmarks.growth.zenoh_modules import knows
 from benchmarks.loops import run_on
 from benchmarks.processes import process
 from r2p.msg import Led
@@ -35,7 +35,7 @@ async def _modules(pipe: Connection, modules: int) -> None:
             await stack.enter_async_context(module)
             module.start(_work, number, modules)
         all_known = (modules - 1, (modules - 1) * TOPICS)
-        while not all(_knows(module, *all_known) for module in started):
+        while not all(knows(module, *all_known) for module in started):
             if time.perf_counter() > began + LIMIT:
                 raise TimeoutError(f"of {modules} modules not all know all")
             await asyncio.sleep(0.1)
@@ -44,11 +44,6 @@ async def _modules(pipe: Connection, modules: int) -> None:
         began, used = time.perf_counter(), time.process_time()
         await asyncio.sleep(AT_REST)
         pipe.send((time.process_time() - used) / (time.perf_counter() - began))
-
-
-def _knows(module: r2p.Module, modules: int, topics: int) -> bool:
-    known_modules, known_topics = counts(module)
-    return known_modules >= modules and known_topics >= topics
 
 
 def _run(pipe: Connection, modules: int) -> None:

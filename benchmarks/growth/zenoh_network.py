@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection
 import r2p
 from benchmarks.growth.curve import Curve
 from benchmarks.growth.fleet import ready
-from benchmarks.growth.zenoh_modules import TOPICS, counts, list_topics, run_router
+from benchmarks.growth.zenoh_modules import TOPICS, knows, list_topics, run_router
 from benchmarks.loops import run_on
 from benchmarks.processes import process
 from benchmarks.zenoh import bare_client, connect
@@ -71,10 +71,10 @@ class _Watch:
 
 async def _join(port: int, modules: int) -> tuple[float, float]:
     """Return s until the module knows all, and s for which its loop was blocked at most."""
-    began, all_of_it = time.perf_counter(), (modules, modules * TOPICS)
+    began = time.perf_counter()
     async with r2p.Module("JOINS", via=connect(port), watchdog=False) as module:
         watch = _Watch()
-        while time.perf_counter() < began + LIMIT and counts(module) != all_of_it:  # noqa: ASYNC110 - there is no event
+        while not knows(module, modules, modules * TOPICS) and time.perf_counter() < began + LIMIT:  # noqa: ASYNC110
             await asyncio.sleep(0.02)
         seconds = time.perf_counter() - began
         await asyncio.sleep(2.0)  # what follows may block, too
