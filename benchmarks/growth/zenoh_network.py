@@ -99,7 +99,7 @@ def measure(modules: int) -> tuple[float, float, float, float]:
                 module.recv()
                 module.send("begin")
                 joined: tuple[float, float, float] = module.recv()
-            listed, found = list_topics(port)
+                listed, found = list_topics(port)  # while it is there: the router takes long to forget who has left
             if found != modules * TOPICS:
                 raise AssertionError(f"r2p topic list shows {found} of {modules * TOPICS} topics")
             return *joined, listed

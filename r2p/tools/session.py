@@ -306,9 +306,10 @@ class Session:
         """Return whether r2p modules, which announce the nodes of their topics, have only announced a topic so far."""
         modules = self.module.network.modules()
         firmware = {view.link for view in modules if view.instance is None}
+        announcing = {view.link for view in modules if view.instance is not None} - firmware
         for view in self.module.network.topics().values():
             for known, links in ((view.publishers, view.published_on), (view.subscribers, view.subscribed_on)):
-                if set(links) & self._links_with_r2p() - {each.link for each in known} - firmware:
+                if announcing.intersection(links) - {each.link for each in known}:
                     return True
         return False
 

@@ -15,6 +15,8 @@ from r2p.codecs import liveliness, management
 from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.liveliness.session import LivelinessDiscovery
 
+RESULTS = Path(draw.__file__).parents[2] / "docs" / "assets" / "performance" / "growth.json"
+
 
 def calls(function: Callable[[], object]) -> int:
     """Return how many functions in Python are called."""
@@ -112,6 +114,11 @@ def test_until_each_message_comes_once() -> None:
     assert router_mesh.until_each_once(sent(1, 2, 12, 13)) == pytest.approx(0.11)
     assert router_mesh.until_each_once(sent(1, 2, 12, 12, 13, 14)) == pytest.approx(0.11)
     assert router_mesh.until_each_once(sent(1, 5, 6, 8, 9)) == pytest.approx(0.07)
+
+
+def test_the_picture_is_what_the_results_on_the_page_give(tmp_path: Path) -> None:
+    draw.draw(draw.read(RESULTS)).write(tmp_path / "growth.svg")
+    assert (tmp_path / "growth.svg").read_text() == RESULTS.with_suffix(".svg").read_text()
 
 
 def test_a_curve_without_a_goal_or_a_value_is_not_drawn(tmp_path: Path) -> None:

@@ -112,6 +112,29 @@ async def test_it_settles_as_soon_as_the_others_have_told_everything(capsys: pyt
     assert capsys.readouterr().err == ""
 
 
+async def many(node: r2p.Node) -> None:
+    for number in range(50):
+        node.advertise(f"t{number}", Led)
+    await asyncio.get_running_loop().create_future()
+
+
+@pytest.mark.virtual_time
+async def test_it_looks_at_the_modules_once_and_not_for_each_topic(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = 0
+    modules = r2p.NetworkView.modules
+
+    def look(network: r2p.NetworkView) -> list[r2p.ModuleView]:
+        nonlocal looks
+        looks += 1
+        return modules(network)
+
+    monkeypatch.setattr(r2p.NetworkView, "modules", look)
+    async with robot(many), tool() as session:
+        await session.settle()
+        assert len(session.module.network.topics()) > 50
+    assert 0 < looks < 30
+
+
 @pytest.mark.virtual_time
 @pytest.mark.parametrize("late", [0.1, 0.8, 1.3])
 async def test_on_a_bus_it_waits_for_those_behind_a_gateway(late: float, capsys: pytest.CaptureFixture[str]) -> None:
