@@ -49,7 +49,7 @@ class MessageSet(msgspec.Struct):
 
 
 def read_csv(text: str) -> MessageSet:
-    """Return the messages of a CSV file. Raises `MessageError` for one that is none."""
+    """Return the messages of a CSV file. Raises `MessageError` if the text is not a valid one."""
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     rows = list(csv.DictReader(lines))
     if not rows or not {"name", "bytes"} <= rows[0].keys():
@@ -58,7 +58,7 @@ def read_csv(text: str) -> MessageSet:
 
 
 def read_toml(text: str) -> MessageSet:
-    """Return the messages of a TOML file, and its bus. Raises `MessageError` for one that is none."""
+    """Return the messages of a TOML file, and its bus. Raises `MessageError` if the text is not a valid one."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -199,7 +199,7 @@ def unpack(key: str) -> list[str]:
 
 @functools.lru_cache(_CACHED)
 def tokens_of(key: str) -> tuple[dict[str, Token], list[DecodeError]]:
-    """Return the tokens that a key stands for, by their own keys, and an error for each part that is none.
+    """Return the tokens that a key stands for, by their own keys, and an error for each invalid part.
 
     Of the last ones the results are kept, not to be changed: all modules of a program get the same keys.
     """

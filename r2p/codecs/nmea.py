@@ -98,7 +98,7 @@ def encode(sentence: Sentence, talker: str = "GP") -> bytes:
 
 
 class NmeaReader:
-    """Turns a stream into sentences. It never fails: what is no sentence to read is counted by reason in `drops`.
+    """Turns a stream into sentences. It never fails: anything else is counted by reason in `drops`.
 
     | reason | received |
     | --- | --- |

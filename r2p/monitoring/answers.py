@@ -122,7 +122,7 @@ class _Section:
 
 
 def _packing(cls: type[Message], entries: Sequence[Message]) -> struct.Struct:
-    """Return what unpacks these entries behind their count: of each, what is no number as bytes, then its numbers."""
+    """Return the struct of a count and these entries: each has its names and flags as bytes, then its numbers."""
     fields = layout(cls).fields
     first = len(fields) - _NUMBERS[cls]
     numbers = "".join(format_of(field.shape) for field in fields[first:])

@@ -83,7 +83,7 @@ class SubscriberCount(msgspec.Struct, eq=False):
 
 
 class ModuleCounters:
-    """The counters of one module. `answers` is None while the first question is open."""
+    """The counters of one module. `answers` is None until the first question was answered, or has timed out."""
 
     def __init__(self) -> None:
         self.answers: bool | None = None

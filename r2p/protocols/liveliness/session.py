@@ -247,7 +247,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._outbox.drain()
 
     def _tokens_of(self, key: str) -> dict[str, liveliness.Token]:
-        """Return the tokens of another session that a key stands for; count what is none."""
+        """Return the tokens of another session that a key stands for; count its invalid parts."""
         tokens, errors = liveliness.tokens_of(key)
         for error in errors:
             self._count_undecodable(error)

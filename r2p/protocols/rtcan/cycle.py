@@ -108,7 +108,7 @@ class Cycle:
 
     @property
     def free_rate(self) -> float:
-        """Free slots a second, in the mean of the last cycles; all of them are while there is no cycle."""
+        """Free slots a second, averaged over the last cycles; without a cycle, all slots are free."""
         return self._mean_free * SECOND / self.timing.cycle
 
     @property

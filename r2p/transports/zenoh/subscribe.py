@@ -15,15 +15,7 @@ import msgspec
 import zenoh
 
 from r2p.codecs import UnknownType
-from r2p.codecs.attachment import (
-    HEADER_MAX,
-    SERIAL_WRAP,
-    Credit,
-    HeaderReader,
-    Origin,
-    encode_credit,
-    split,
-)
+from r2p.codecs.attachment import HEADER_MAX, SERIAL_WRAP, Credit, HeaderReader, Origin, encode_credit, split
 from r2p.codecs.management import ANY_TYPE
 from r2p.errors import DecodeError
 from r2p.protocols.discovery.events import TopicType
