@@ -117,6 +117,9 @@ def _warn_set_back(ahead: int) -> None:
 
 _SYSTEM: Final = SystemClock()
 _RANDOM: Final = random.Random()
+if hasattr(os, "register_at_fork"):  # not on Windows
+    # Two modules of one random number would be one to their network, and discard what the other one says.
+    os.register_at_fork(after_in_child=_RANDOM.seed)
 
 
 def clock_of(loop: asyncio.AbstractEventLoop | None = None) -> Clock:

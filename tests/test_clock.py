@@ -7,7 +7,10 @@ import errno
 import itertools
 import math
 import random
+import subprocess
+import sys
 import time
+from textwrap import dedent
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import pytest
@@ -114,6 +117,22 @@ def test_without_a_loop_time_and_random_numbers_are_the_computers() -> None:
     assert abs(clock.now() - time.time_ns()) < 60 * SECOND
     assert clock.monotonic() <= time.monotonic_ns()
     assert random_of() is random_of()
+
+
+@pytest.mark.processes
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no fork")
+def test_a_fork_has_random_numbers_of_its_own() -> None:
+    program = """
+        import os
+        from r2p.clock import random_of
+
+        pid = os.fork()
+        os.write(1, f"{random_of().getrandbits(64)}\\n".encode())
+        if pid:
+            os.waitpid(pid, 0)
+    """
+    done = subprocess.run([sys.executable, "-c", dedent(program)], capture_output=True, text=True, check=True)
+    assert len(set(done.stdout.split())) == 2
 
 
 def test_a_loop_may_bring_its_own_time_and_random_numbers() -> None:
