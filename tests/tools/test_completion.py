@@ -180,6 +180,8 @@ def test_bash_cuts_words_at_colons(parts: str, words: str, there: str) -> None:
 def install(tmp_path: Path) -> Iterator[Callable[[str], Process]]:
     """Install completion from a shell, and return another terminal with it."""
     environment = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "HOME": str(tmp_path), "TERM": "dumb"}
+    # Without this folder, the first fish reads all manual pages of the system, half a minute of work, as the test ends.
+    (tmp_path / ".local/share/fish/generated_completions").mkdir(parents=True)
     with contextlib.ExitStack() as stack:
 
         def run(command: str) -> Process:
