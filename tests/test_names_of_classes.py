@@ -3,7 +3,9 @@
 import ast
 import functools
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import pytest
 
@@ -18,10 +20,35 @@ FILE_LINES = 600
 FUNCTION_LINES = 60
 
 
+class Definition(NamedTuple):
+    """A class or a function; no part of its tree, as the trees of all sources are slow to keep."""
+
+    place: str
+    name: str
+    lines: int
+    kind: Literal["function", "class", "message"]
+
+
 @functools.cache
-def nodes() -> list[tuple[str, ast.AST]]:
-    """Everything in the sources: no work for those who only collect this test."""
-    return [(path, node) for path, source in sorted(SOURCES.items()) for node in ast.walk(ast.parse(source))]
+def definitions() -> list[Definition]:
+    """All classes and functions in the sources: no work for those who only collect this test."""
+    return [each for path, source in sorted(SOURCES.items()) for each in _defined(path, ast.parse(source))]
+
+
+def _defined(path: str, node: ast.AST) -> Iterator[Definition]:
+    """Those in the statements under this node: expressions, which are most of a tree, have none."""
+    for each in ast.iter_child_nodes(node):
+        if isinstance(each, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            lines = (each.end_lineno or each.lineno) - each.lineno + 1
+            yield Definition(f"{path}:{each.lineno}", each.name, lines, _kind(path, each))
+        if not isinstance(each, ast.expr):
+            yield from _defined(path, each)
+
+
+def _kind(path: str, node: ast.stmt) -> Literal["function", "class", "message"]:
+    if not isinstance(node, ast.ClassDef):
+        return "function"
+    return "message" if is_message(path, node) else "class"
 
 
 def is_message(path: str, node: ast.ClassDef) -> bool:
@@ -34,9 +61,9 @@ def is_message(path: str, node: ast.ClassDef) -> bool:
 
 def test_a_class_name_exists_once() -> None:
     places = defaultdict(list)
-    for path, node in nodes():
-        if isinstance(node, ast.ClassDef) and not is_message(path, node):
-            places[node.name.lstrip("_")].append(f"{path}:{node.lineno}")
+    for each in definitions():
+        if each.kind == "class":
+            places[each.name.lstrip("_")].append(each.place)
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
@@ -45,10 +72,5 @@ def test_files_are_short() -> None:
 
 
 def test_functions_are_short() -> None:
-    long = {}
-    for path, node in nodes():
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            lines = (node.end_lineno or node.lineno) - node.lineno + 1
-            if lines > FUNCTION_LINES:
-                long[f"{path}:{node.lineno} {node.name}"] = lines
-    assert long == {}
+    functions = [each for each in definitions() if each.kind == "function"]
+    assert {f"{each.place} {each.name}": each.lines for each in functions if each.lines > FUNCTION_LINES} == {}
