@@ -1,14 +1,18 @@
 """A nearly full bus: 20 modules that reserve 50 to 95 % of the slots (thesis 3.3.1 and 4.3.4).
 
 `python -m benchmarks.full_bus` runs, under virtual time, modules whose periodic topics need one slot in each cycle,
-and each of which the next module subscribes to. It prints when all slots were granted, which were lost later, and the
-share of management, the same each time.
+and each of which the next module subscribes to. It prints when all slots were granted, when messages of all topics had
+arrived, which slots were lost later, and the share of management, the same each time.
+
+Some slots have to stay free: the master refuses topics that would leave too few for what keeps the others. The command
+says how many, and why.
 """
 
 import argparse
 import asyncio
+import functools
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 
 import msgspec
@@ -16,6 +20,7 @@ import msgspec
 import r2p
 from benchmarks.twenty_modules import Traffic
 from r2p import sim
+from r2p.protocols.rtcan.leases import frames_needed
 from r2p.transports.rtcan.link import RtcanLink
 from r2p.transports.rtcan.tx import SlottedTopic
 
@@ -35,10 +40,16 @@ class Eight(r2p.Message):
 
 
 class FullBus(msgspec.Struct, frozen=True):
-    """What happened at one load. `granted` and `known` are in s after power, None: not within a minute."""
+    """What happened at one load. Times are in s after power, None: not within a minute."""
 
     granted: float | None
+    """All topics have their slots, but for those that are refused."""
     known: float | None
+    """All modules know all topics."""
+    flowing: float | None
+    """A message of each topic has arrived at its subscriber."""
+    refused: str
+    """Why topics were refused; empty if none was."""
     lost: int
     """Times that a topic lost its slots, of all topics, in the time watched."""
     missed: int
@@ -53,34 +64,52 @@ async def measure(percent: int, seconds: float, seed: int, modules: int = MODULE
     can = sim.can_bus("full", seed=seed)
     traffic = Traffic(can)
     count = SLOTS * percent // 100 - 1  # one is the sync's
+    time = asyncio.get_running_loop().time
+    started, arrived = time(), set[str]()
     async with AsyncExitStack() as stack:
         links: list[RtcanLink] = []
         for number in range(modules):
             module = await stack.enter_async_context(r2p.Module(f"M{number}", via="sim:full", watchdog=False))
-            module.start(_node, [f"t{each}" for each in range(count)], number, modules)
+            module.start(_node, [f"t{each}" for each in range(count)], number, modules, arrived)
             links += [link for link in module.links if isinstance(link, RtcanLink)]
-        granted = await _until(lambda: _granted(links) == count)
         topics = {f"t{each}" for each in range(count)}
-        known = await _until(lambda: all(topics <= link.discovery.topics.keys() | link.slots.keys() for link in links))
+        granted = await _until(lambda: _granted(links) + len(_refusals(links)) == count, started)
+        known = await _until(lambda: _is_known(links, topics), started)
+        flowing = await _until(lambda: arrived == topics, started)
         everything = [topic for link in links for topic in link.slots.values()]
         missed = sum(each.missed for each in everything)
         traffic.reset()
         lost = await _count_lost(everything, seconds)
         management = traffic.bits["management"] / seconds / can.bitrate
         missed = sum(each.missed for each in everything) - missed
-        return FullBus(granted, known and known + (granted or 0.0), lost, missed, count, management)
+        refused = "; ".join(sorted(set(_refusals(links).values())))
+        return FullBus(granted, known, flowing, refused, lost, missed, count, management)
 
 
-async def _node(node: r2p.Node, topics: Sequence[str], number: int, modules: int) -> None:
+async def _node(node: r2p.Node, topics: Sequence[str], number: int, modules: int, arrived: set[str]) -> None:
     for each in topics[number::modules]:
         node.advertise(each, Eight, r2p.Periodic(PERIOD, Eight))
     for each in topics[(number + 1) % modules :: modules]:
-        node.subscribe(each, Eight, callback=lambda sample: None)
+        node.subscribe(each, Eight, callback=functools.partial(_note, arrived, each))
     await asyncio.get_running_loop().create_future()
+
+
+def _note(arrived: set[str], topic: str, message: Eight) -> None:
+    arrived.add(topic)
 
 
 def _granted(links: Sequence[RtcanLink]) -> int:
     return sum(bool(topic.period) for link in links for topic in link.slots.values())
+
+
+def _refusals(links: Sequence[RtcanLink]) -> dict[str, str]:
+    """Return why topics have no slots."""
+    slots = [each for link in links for each in link.slots.values()]
+    return {each.topic.name: each.refusal for each in slots if each.refusal and not each.period}
+
+
+def _is_known(links: Sequence[RtcanLink], topics: set[str]) -> bool:
+    return all(topics <= link.discovery.topics.keys() | link.slots.keys() for link in links)
 
 
 async def _count_lost(topics: Sequence[SlottedTopic], seconds: float) -> int:
@@ -94,14 +123,14 @@ async def _count_lost(topics: Sequence[SlottedTopic], seconds: float) -> int:
     return lost
 
 
-async def _until(done: object) -> float | None:
+async def _until(done: Callable[[], bool], started: float) -> float | None:
+    """Wait until something is so; return how long that was after the start (s), None after the limit."""
     time = asyncio.get_running_loop().time
-    start = time()
-    while not done():  # type: ignore[operator]
+    while not done():
         await asyncio.sleep(_POLL)
-        if time() - start > _LIMIT:
+        if time() - started > _LIMIT:
             return None
-    return time() - start
+    return time() - started
 
 
 def main() -> None:
@@ -112,12 +141,19 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     logging.disable()
-    head = "slots reserved", "all granted after s", "all topics known after s", "slots lost", "missed", "management"
+    head = ["slots reserved", "granted after s", "topics known after s", "messages of all topics after s"]
+    head += ["slots lost", "missed", "management"]
     print(f"| {' | '.join(head)} |\n|{' ---: |' * len(head)}")
+    refused: dict[int, str] = {}
     for percent in options.percent or (50, 70, 80, 85, 90, 95):
         each = sim.run(lambda: measure(percent, options.seconds, options.seed), seed=options.seed)  # noqa: B023
-        when = ["never" if at is None else f"{at:.2f}" for at in (each.granted, each.known)]
+        when = ["never" if at is None else f"{at:.2f}" for at in (each.granted, each.known, each.flowing)]
         print(f"| {percent} % | {' | '.join(when)} | {each.lost} | {each.missed} | {each.management:.1%} |", flush=True)
+        refused |= {percent: each.refused} if each.refused else {}
+    needed = frames_needed(MODULES)
+    for percent, reason in refused.items():
+        left = (SLOTS - SLOTS * percent // 100) / PERIOD
+        print(f"{percent} % would leave {left:.0f} slots a second, and {MODULES} modules need {needed}: {reason}")
 
 
 if __name__ == "__main__":

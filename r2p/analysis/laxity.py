@@ -25,6 +25,7 @@ from r2p.analysis.slots import SlotSupply
 from r2p.codecs import management
 from r2p.codecs.rtcan import SRT_MAX
 from r2p.protocols.rtcan.management import CONTROL_DEADLINE, DEADLINE
+from r2p.protocols.rtcan.queue import DISCOVERY
 from r2p.units import MILLISECOND, SECOND
 
 _CLAMPED = SRT_MAX * MILLISECOND
@@ -269,8 +270,8 @@ class _Events:
             response = found
 
     def _last(self, load: _Load) -> int:
-        """Return for how long a message has one laxity before its deadline (ns): a millisecond, discovery two."""
-        return self._quantum * (2 if load.message.urgency is Urgency.EASED else 1)
+        """Return for how long a message has one laxity before its deadline (ns): a millisecond, discovery more."""
+        return self._quantum * (DISCOVERY if load.message.urgency is Urgency.EASED else 1)
 
     def _rivals(self, load: _Load, loads: list[_Load], first: int, last: int) -> list[_Rival]:
         """Return what may win slots against a message that arrives between two instants after a busy period began."""

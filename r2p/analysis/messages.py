@@ -41,7 +41,7 @@ class Urgency(enum.Enum):
     LENT = "lent"
     """Also as the discovery of its node that waits behind it: up to any."""
     EASED = "eased"
-    """In its last two milliseconds as with two left, and so when it is overdue: discovery (PROTOCOL.md 6)."""
+    """In its last four milliseconds as with four left, and so when it is overdue: discovery (PROTOCOL.md 6)."""
 
 
 class BusMessage(msgspec.Struct, frozen=True, kw_only=True):

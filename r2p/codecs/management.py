@@ -193,6 +193,7 @@ class RefuseReason(enum.IntEnum):
     TAKEN = 5  # the slots that it had were given to another message
     MANY = 6  # no further reservation can be kept
     FACTOR = 7  # the greatest common factor with the cycle, or with the period of another message, is too small
+    MANAGEMENT = 8  # the slots that are left are needed for management
 
 
 SIZE_VARIES = 0x8000

@@ -117,8 +117,8 @@ def test_control_is_as_urgent_as_the_discovery_that_waits_behind_it() -> None:
     assert discovery <= 50 * MILLISECOND
 
 
-def test_discovery_loses_ties_for_its_last_two_milliseconds() -> None:
-    """As it is no more urgent then than with two left."""
+def test_discovery_loses_ties_for_its_last_four_milliseconds() -> None:
+    """As it is no more urgent then than with four left."""
     before = [event(f"e{number}", 4.9, period=200) for number in range(17)]
     tied = [event(f"t{number}", 9.5, period=200) for number in range(10)]
     own = event("own", 5, period=200)

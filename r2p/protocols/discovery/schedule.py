@@ -37,6 +37,8 @@ _PRESENCE_EACH = SECOND // 100
 """The same, for each module on the link."""
 _PRESENCE_SHARE = 8
 """The same in message times: on a slow line, presences would leave no room for anything else."""
+_PRESENCE_HELD = SECOND // 2
+"""Ns for which a presence waits at most while all is held back."""
 _QUIET_MAX = SECOND
 """Ns that a step waits at most for a line to be quiet."""
 _ITEM_MESSAGES = 2
@@ -127,7 +129,7 @@ class Schedule:
         """Whether a topic waits for no answer; called for those of a crowd."""
 
     def hold(self, until: int) -> None:
-        """Let nothing go before this instant (ns)."""
+        """Let nothing go before this instant (ns), but for presences that are overdue."""
         self._held = until
 
     def set_pace(self, rate: float, burst: int, quiet: int) -> None:
@@ -205,12 +207,12 @@ class Schedule:
     def due(self) -> int:
         """Return when to call `pop` (ns)."""
         # The cost of an item is known only when its messages are made: there must be room for the most possible.
-        at = self._bucket.ready_at(_ITEM_MESSAGES)
-        if self._held > at:  # no `max`: this is called for each message that is received
-            at = self._held
-        if not (self._fresh or self._relayed) and (turn := self._turn_at()) > at:
-            at = turn
-        return at
+        at = turn = self._bucket.ready_at(_ITEM_MESSAGES)
+        if not (self._fresh or self._relayed) and (other := self._turn_at()) > turn:
+            turn = other
+        if self._held <= turn:  # no `max`: this is called for each message that is received
+            return turn
+        return min(self._held, max(at, self._presence_at + _PRESENCE_HELD))
 
     def pop(self, now: int) -> Item | None:
         """Return the item to announce now, if any; `sent` takes its cost."""
@@ -220,6 +222,8 @@ class Schedule:
             self._repeat(now)
             if self.due() > now:
                 return None
+        if self._held > now:
+            return self._presence(now)
         if self._fresh and now - self._presence_at < _ROUND:  # a thousand new topics outlast the lease of the module
             item, _ = self._fresh.popitem(last=False)
             if not item.once:
@@ -236,8 +240,7 @@ class Schedule:
         if not (presence and self._crowd and (self._ring or self._slow)):
             self._step_at = now + self._interval
         if presence:
-            self._presence_sent, self._presence_at = now, now + self._presence_period
-            return Item(ItemKind.PRESENCE, once=True)
+            return self._presence(now)
         return self._repetition()
 
     def sent(self, now: int, count: int) -> None:
@@ -298,6 +301,10 @@ class Schedule:
         for item in reversed(names):
             self._ring.move_to_end(item, last=False)
         self._lap = max(self._lap, self._count)
+
+    def _presence(self, now: int) -> Item:
+        self._presence_sent, self._presence_at = now, now + self._presence_period
+        return Item(ItemKind.PRESENCE, once=True)
 
     def _repetition(self) -> Item:
         """The next item of the ring, or of the slow ring so often that it turns once in `_rounds`."""

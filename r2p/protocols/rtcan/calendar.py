@@ -89,6 +89,8 @@ class Refusal(msgspec.Struct, frozen=True):
                 return f"no {run} free every {self.period} slots"
             case RefuseReason.TAKEN:
                 return "its slots were given to another message"
+            case RefuseReason.MANAGEMENT:
+                return "the few slots that are left carry what keeps the others: announcements and renewals"
             case RefuseReason.MANY:
                 return f"all {_RESERVATIONS_MAX} reservations are in use"
 
@@ -127,7 +129,7 @@ class Calendar:
         for wanted in self._candidates(period, round_down):
             if before is not None and (before.period, before.fragments) == (wanted, fragments):
                 return self._enter(before)
-            outcome = self._place(message, wanted, fragments, least=round_down and self._is_harmonic(wanted))
+            outcome = self._place(message, wanted, fragments, round_down=round_down)
             if isinstance(outcome, Reservation):
                 return self._enter(outcome)
             refusals.append(outcome)
@@ -186,13 +188,13 @@ class Calendar:
         periods = sorted({self.slots, period, *(each.period for each in self._entries.values())})
         return all(longer % shorter == 0 for shorter, longer in pairwise(periods))
 
-    def _place(self, message: int, period: int, fragments: int, *, least: bool) -> Reservation | Refusal:
+    def _place(self, message: int, period: int, fragments: int, *, round_down: bool) -> Reservation | Refusal:
         if (refusal := self._impossible(message, period, fragments)) is not None:
             return refusal
         starts = _starts(self.free(period), fragments)
         if not starts:
             return Refusal(message, RefuseReason.FULL, period, fragments)
-        if least or self.rule is PeriodRule.HARMONIC:
+        if self.rule is PeriodRule.HARMONIC or (round_down and self._is_harmonic(period)):
             return Reservation(message, period, next(_set_bits(starts)), fragments)
         return Reservation(message, period, self._phase(starts, period, fragments), fragments)
 

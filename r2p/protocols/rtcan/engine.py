@@ -42,7 +42,7 @@ from r2p.protocols.rtcan.node_id import NodeId, Stage
 from r2p.protocols.rtcan.queue import QueuedMessage
 from r2p.protocols.rtcan.reassembly import Reassembly
 from r2p.protocols.rtcan.transmitter import Mode, SlotTransmitter
-from r2p.units import NEVER
+from r2p.units import NEVER, SECOND
 
 _NOTHING: tuple[Action, ...] = ()
 # Python 3.11 is slow to find a member of an enum.
@@ -132,6 +132,10 @@ class Engine:
         if time is not None and self.election.role is Role.MASTER:
             self.network.utc_offset = utc - time
             self.network.utc_error = min(-(-error // 1000), management.NO_UTC - 1)
+
+    def set_discovery_rate(self, rate: float) -> None:
+        """Set how many messages of discovery a second this node may send before others that are overdue."""
+        self.transmitter.queue.starved_apart = round(SECOND / rate)
 
     def report_syncs(self, wanted: bool) -> None:
         """Return a `SyncSeen` for each sync from now on, or no longer."""

@@ -1,8 +1,9 @@
 """Periodic messages and their slots, on lease from the master: requested, granted, and planned slot by slot.
 
 The node renews the slots that it still needs every second. A lease lasts 3 s: for its owner from the request, for the
-master from the grant, so an owner without answers stops first. A new master of the same epoch renews the grants of the
-last one; for three cycles it grants nothing else. `SlotGrants` is the master's side.
+master from the grant, so an owner without answers stops first. Where renewals would take too much of the slots that are
+free, the master grants longer leases, and each is renewed after a third of it. A new master of the same epoch renews
+the grants of the last one; for three cycles it grants nothing else. `SlotGrants` is the master's side.
 
 At the owner, `SlotRequests` keeps the leases, and `SlotPlan` has the actions of each slot. Slots are the clock of a
 `PeriodicMessage`: `lead` before the first one of each occurrence its data are asked for, then each fragment has its
@@ -21,10 +22,16 @@ from r2p.protocols.rtcan.cycle import Timing, following
 from r2p.protocols.rtcan.events import Due, EngineContext, SlotsGranted, SlotsLost, SlotsRefused
 from r2p.units import LONG_AGO, MILLISECOND, SECOND
 
-LEASE = 3_000_000_000  # ns, as the next two: two renewals may be lost
-_RENEWAL = SECOND
+LEASE = 3_000_000_000  # ns, as the next four: two renewals may be lost
+_LEASE_MAX = 15_000_000_000  # for so long nobody else gets the slots of a module that lost its power
+_RENEWALS = 3  # in a lease
+_RENEWAL = LEASE // _RENEWALS
 _RETRY = 250_000_000
 _PLANS_MAX = 256  # plans of cycles that are kept
+_RENEWAL_FRAMES = 8  # of a renewal and its answer
+_RENEWAL_SHARE = 8  # part of the free slots, at most, for all renewals
+_OWNER_FRAMES = 7  # a second, of each owner: a claim each 3 s, a renewal each 5 s, and a message of discovery
+_MASTER_FRAMES = 4  # a second: NETWORK
 _AHEAD = 1  # cycles from a grant to its first slot: by then all nodes have the new mask
 
 
@@ -36,7 +43,8 @@ class PeriodicMessage(msgspec.Struct, eq=False):
     `active`: its slots may be used, from `from_cycle` on. Of an occurrence: `payload` to send in so many `frames`,
     those `sent`, and `waiting`, the number of the slot for which data were asked but not given yet. Without slots:
     `tick`, when it is due next, and `ticked`, whether data were asked. Of its requests: `asked`, when each was sent, by
-    serial; `confirmed`, when the one was sent that was granted last; `refused`, the reason of the last `SlotsRefused`.
+    serial; `confirmed`, when the one was sent that was granted last, and `lease`, for how long (ns); `refused`, the
+    reason of the last `SlotsRefused`.
     """
 
     high: int
@@ -60,6 +68,7 @@ class PeriodicMessage(msgspec.Struct, eq=False):
     ticked: bool = False
     asked: dict[int, int] = msgspec.field(default_factory=dict)
     confirmed: int = LONG_AGO
+    lease: int = LEASE
     refused: str = ""
 
     def takes(self, size: int) -> bool:
@@ -162,6 +171,29 @@ class SlotGrants:
         self._cycle = context.cycle
         self._timers = context.timers
 
+    @property
+    def lease(self) -> int:
+        """Return how long a lease is now (ns): the fewer slots are free, the more seldom it is renewed."""
+        free, owners = self._free_rate, len(self._owners)
+        renewal = _RENEWAL_SHARE * _RENEWAL_FRAMES * owners * SECOND / max(free, 1.0)
+        return min(max(LEASE, round(_RENEWALS * renewal)), _LEASE_MAX) // MILLISECOND * MILLISECOND
+
+    @property
+    def _owners(self) -> set[int]:
+        return {rtcan.id8_of(each.message) for each in self.calendar}
+
+    @property
+    def _free_rate(self) -> float:
+        """Slots a second that are not reserved."""
+        timing = self._cycle.timing
+        taken = 1 / timing.slots + sum(each.fragments / each.period for each in self.calendar)
+        return (1 - taken) * SECOND / timing.slot
+
+    @property
+    def _is_too_full(self) -> bool:
+        """Return whether the slots that are left are too few for what keeps all others: then all would be lost."""
+        return self._free_rate < frames_needed(len(self._owners))
+
     def clear(self) -> None:
         """Forget all grants."""
         for each in list(self.calendar):
@@ -180,21 +212,26 @@ class SlotGrants:
         else:
             round_down = bool(wanted.flags & management.RESERVE_ROUND_DOWN)
             outcome = self.calendar.admit(wanted.message, wanted.period, wanted.fragments, round_down=round_down)
+            if held is None and isinstance(outcome, Reservation) and self._is_too_full:
+                self.calendar.remove(wanted.message)
+                outcome = Refusal(wanted.message, RefuseReason.MANAGEMENT, outcome.period, outcome.fragments)
         if isinstance(outcome, Refusal):
             self._timers.clear(("granted", wanted.message))
             _, reason, period, fragments, other, rival = msgspec.structs.astuple(outcome)
             return Refuse(wanted.message, wanted.serial, int(reason), fragments, period, other, rival)
-        self._timers.set(("granted", wanted.message), now + LEASE)
+        lease = self.lease
+        self._timers.set(("granted", wanted.message), now + lease)
         start = self._cycle.counter + (0 if outcome == held else _AHEAD)  # what it had is in all masks already
         _, period, phase, fragments = msgspec.structs.astuple(outcome)
-        return Grant(wanted.message, wanted.serial, fragments, period, phase, start, epoch, LEASE // MILLISECOND)
+        return Grant(wanted.message, wanted.serial, fragments, period, phase, start, epoch, lease // MILLISECOND)
 
     def renew(self, now: int, wanted: Renew, id8: int) -> Renewed:
         """Extend the leases that a module still needs. Those without a grant are missing in the answer."""
         held = [high for high in wanted.highs if high and self.calendar.get(rtcan.message_id(high, id8)) is not None]
+        lease = self.lease
         for high in held:
-            self._timers.set(("granted", rtcan.message_id(high, id8)), now + LEASE)
-        return Renewed(id8, wanted.serial, LEASE // MILLISECOND, bytes(held).ljust(management.RENEW_MAX, b"\0"))
+            self._timers.set(("granted", rtcan.message_id(high, id8)), now + lease)
+        return Renewed(id8, wanted.serial, lease // MILLISECOND, bytes(held).ljust(management.RENEW_MAX, b"\0"))
 
     def remove(self, message: int) -> None:
         """Free the slots of a message: its owner gave them back, or did not renew the lease."""
@@ -305,7 +342,7 @@ class SlotRequests:
         active = [each for each in self._periodics.values() if each.active]
         if not self.has_master or not active:
             return
-        self._timers.set("renew", now + _RENEWAL)
+        self._timers.set("renew", now + max(_RENEWAL, min(each.lease for each in active) // _RENEWALS))
         for first in range(0, len(active), management.RENEW_MAX):
             part = active[first : first + management.RENEW_MAX]
             highs = bytes(each.high for each in part).ljust(management.RENEW_MAX, b"\0")
@@ -389,14 +426,20 @@ class SlotRequests:
     def _next_serial(self, now: int, *periodics: PeriodicMessage) -> int:
         self._serial = (self._serial + 1) % management.REQUEST_SERIALS
         for each in periodics:
-            # Late answers to requests of the last 3 s count; older ones would grant an expired lease.
-            each.asked = {serial: at for serial, at in each.asked.items() if now < at + LEASE} | {self._serial: now}
+            # Late answers to requests within a lease count; older ones would grant an expired lease.
+            each.asked = {serial: at for serial, at in each.asked.items() if now < at + each.lease}
+            each.asked[self._serial] = now
         return self._serial
 
     def _confirm(self, periodic: PeriodicMessage, asked: int, lease_ms: int) -> None:
         if asked >= periodic.confirmed:  # answers may come out of order
-            periodic.confirmed = asked
-            self._timers.set(("lease", periodic.high), asked + lease_ms * MILLISECOND)
+            periodic.confirmed, periodic.lease = asked, lease_ms * MILLISECOND
+            self._timers.set(("lease", periodic.high), asked + periodic.lease)
+
+
+def frames_needed(owners: int) -> int:
+    """Return how many free slots a second it takes at least to keep the slots of so many modules."""
+    return _MASTER_FRAMES + _OWNER_FRAMES * owners
 
 
 def _set_bits(bits: int) -> Iterable[int]:

@@ -9,12 +9,14 @@ from collections import Counter, deque
 from collections.abc import Callable, Hashable
 
 from r2p.codecs import management, rtcan
+from r2p.codecs.management import ManagementType, type_of
+from r2p.codecs.rtcan import SRT_MIN
 from r2p.protocols.rtcan.events import EngineContext, Fate, Profile
 from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.network import Detector, NetworkMembership
 from r2p.protocols.rtcan.node_id import NodeId
-from r2p.protocols.rtcan.queue import QueuedMessage
+from r2p.protocols.rtcan.queue import DISCOVERY, PRESENCE, REQUEST, QueuedMessage
 from r2p.protocols.rtcan.transmitter import SlotTransmitter
 from r2p.units import LONG_AGO, MILLISECOND, NEVER
 
@@ -27,6 +29,7 @@ QUIET = 33_000_000
 """Among firmware: ns without management on the bus before any is sent."""
 _SPREAD = 20_000_000  # ns; on one message id two nodes must not start at the same time
 _MAX = 64  # messages that wait for silence
+_PRESENCES = (ManagementType.ALIVE, ManagementType.HELLO, ManagementType.NAME)
 
 
 class RateLimiter:
@@ -103,19 +106,23 @@ class ManagementSender:
         self._transmitter = transmitter
 
     def send(self, now: int, message: management.Management) -> None:
-        """Send a message of the engine itself."""
+        """Send a message of the engine itself, in the place of one about the same that waits and is out of date."""
         data = management.encode(message)
         if self._detector.profile is Profile.FIRMWARE:
             self.send_bytes(now, data)
-        else:
-            self._enqueue(now, self._message_id(), data, None, CONTROL_DEADLINE)
+            return
+        subject, queue = _subject(message), self._transmitter.queue
+        queue.withdraw(self._message_id(), lambda each: each.subject == subject)
+        floor = REQUEST if isinstance(message, management.Reserve) else SRT_MIN
+        self._enqueue(now, self._message_id(), data, None, CONTROL_DEADLINE, floor, subject)
 
     def send_bytes(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> None:
         """Send a message; before the others, if it is urgent. One that waits already is not sent twice."""
         if self._detector.profile is not Profile.FIRMWARE:
             message = self._message_id()
             if urgent or handle is not None or not self._transmitter.queue.repeats(message, data):
-                self._enqueue(now, message, data, handle, _URGENT if urgent else DEADLINE)
+                within, floor = (_URGENT, SRT_MIN) if urgent else (DEADLINE, _floor(data))
+                self._enqueue(now, message, data, handle, within, floor)
             return
         dropped = self.limiter.put(data, urgent=urgent, handle=handle)
         self._context.report(dropped, Fate.FULL, missed=False, at=now)
@@ -124,20 +131,52 @@ class ManagementSender:
         """Among firmware: send the next message if the bus is quiet."""
         due = self.limiter.pop(now)
         if due is not None:
-            self._enqueue(now, rtcan.FIRMWARE_MANAGEMENT, *due, DEADLINE)
+            self._enqueue(now, rtcan.FIRMWARE_MANAGEMENT, *due, DEADLINE)  # no floor: there are no leases of slots
 
     def _message_id(self) -> int:
         return rtcan.message_id(rtcan.MANAGEMENT, self._node_id.id8)
 
-    def _enqueue(self, now: int, message: int, data: bytes, handle: Hashable, within: int) -> None:
-        # Among firmware there are no leases of slots that discovery could stop.
-        eased = within == DEADLINE and message != rtcan.FIRMWARE_MANAGEMENT
-        outgoing = QueuedMessage(message, data, now + within, drop=False, handle=handle, eased=eased)
-        if self._transmitter.queue.put(outgoing, urgent=within < DEADLINE, management=True):
+    def _enqueue(
+        self,
+        now: int,
+        message: int,
+        data: bytes,
+        handle: Hashable,
+        within: int,
+        floor: int = SRT_MIN,
+        subject: Hashable = None,
+    ) -> None:
+        deadline = now + within
+        outgoing = QueuedMessage(message, data, deadline, drop=False, handle=handle, floor=floor, subject=subject)
+        if self._transmitter.queue.put(outgoing, urgent=floor < DISCOVERY, management=True):
             self._transmitter.reschedule(now)
         else:
             self._context.counts["management dropped"] += 1
             self._context.report(handle, Fate.FULL, missed=False, at=now)
+
+
+def _floor(data: bytes) -> int:
+    """Return the least laxity of a message of discovery. A good-bye stays behind what was said before it."""
+    if type_of(data) not in _PRESENCES:
+        return DISCOVERY
+    message = management.decode(data)
+    leaves = isinstance(message, management.Hello) and message.flags & management.HELLO_LEAVING
+    return DISCOVERY if leaves else PRESENCE
+
+
+def _subject(message: management.Management) -> Hashable:
+    """Return what a message of the engine is about: a later one about the same makes it needless."""
+    match message:
+        case management.Reserve(of) | management.Release(of):
+            return "wanted", of
+        case management.Grant(of) | management.Refuse(of):
+            return "answer", of
+        case management.Renew(highs=highs):
+            return "needed", highs
+        case management.Renewed(id8=id8, highs=highs):
+            return "renewed", id8, highs
+        case _:
+            return type(message)
 
 
 class ManagementHandlers:

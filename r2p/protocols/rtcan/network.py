@@ -287,7 +287,6 @@ class NetworkMembership:
             return
         self._sent_at = now
         self._timers.set("network", now + REPEAT)
-        self._transmitter.withdraw_network(self.node_id.id8)  # its counter is old by now
         timing, counter = self._cycle.timing, self._cycle.counter
         id8, priority = self.node_id.id8, self._context.settings.priority
         offset, error = self.utc_offset, self.utc_error

@@ -6,8 +6,10 @@ that have the same laxity at this moment (whole ms) are next to each other, and 
 
 Laxity is computed anew at every try: `next_frame` changes no order, only `frame_sent` does.
 
-Discovery is `eased`: while it is overdue it stays at `EASED`, behind everything else that is. Else twenty modules that
-have too much to say would fill all free slots, and those with low ids would keep the leases of the others out.
+Management has a `floor`, the least laxity that it has while it is overdue. That of discovery is `DISCOVERY`, behind
+everything else that is overdue: else twenty modules that have too much to say would fill all free slots, and those with
+low ids would keep the leases of the others out. That of requests for slots is `REQUEST`, between these two: else the
+requests of nodes with low ids would keep back the answers of a master with a high one.
 """
 
 from bisect import bisect_left, insort
@@ -17,11 +19,13 @@ from collections.abc import Callable, Hashable, Iterator
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import FRAME_MAX, LAXITY_SHIFT, MESSAGE_SHIFT, NRT, SRT_MAX, Frame
+from r2p.codecs.rtcan import FRAME_MAX, LAXITY_SHIFT, MESSAGE_SHIFT, NRT, SRT_MAX, SRT_MIN, Frame
 from r2p.units import LONG_AGO, MILLISECOND, NEVER, SECOND
 
-EASED = rtcan.SRT_MIN + 1
-"""The least laxity of discovery, until it is `_STARVED`."""
+REQUEST = rtcan.SRT_MIN + 1
+PRESENCE = rtcan.SRT_MIN + 2
+DISCOVERY = rtcan.SRT_MIN + 3
+"""The least laxities of requests for slots, of presences and of other discovery, until they are `_STARVED`."""
 _STARVED = (
     2 * SECOND
 )  # ns overdue, less than a lease; then events that are overdue and not dropped have had the bus for long enough
@@ -33,8 +37,9 @@ class QueuedMessage(msgspec.Struct, eq=False):
     """A waiting message. `deadline` NEVER: non real-time. `drop`: given up when overdue, unless it has started.
 
     Once its first frame is sent it is always finished: firmware of 2014 loses the next message as well when the end of
-    one is missing. `recalled`: its frame was withdrawn, as the node uses the bus in another way from now on. `eased`:
-    it is discovery.
+    one is missing. `recalled`: its frame was withdrawn, as the node uses the bus in another way from now on. `floor`:
+    its least laxity while it is overdue, unless it is `starved`. `subject`: what it is about; a later one about the
+    same makes it needless.
     """
 
     message: int
@@ -48,7 +53,9 @@ class QueuedMessage(msgspec.Struct, eq=False):
     errors: int = 0
     unknown: bool = False
     recalled: bool = False
-    eased: bool = False
+    floor: int = SRT_MIN
+    starved: bool = False
+    subject: Hashable = None
 
     @property
     def expiry(self) -> int:
@@ -58,7 +65,7 @@ class QueuedMessage(msgspec.Struct, eq=False):
 
 class _MessageFifo(msgspec.Struct, eq=False):
     """The messages of one topic. `busy`: the port has a frame of the first one; `held`: no try before this instant.
-    `deadline`, `order` and `expiry` are the earliest of its messages. `eased`: all of them are.
+    `deadline`, `order`, `expiry` and `floor` are the least of its messages.
     """
 
     waiting: deque[QueuedMessage]
@@ -67,14 +74,14 @@ class _MessageFifo(msgspec.Struct, eq=False):
     expiry: int = NEVER
     busy: bool = False
     held: int = LONG_AGO
-    eased: bool = False
+    floor: int = SRT_MIN
 
     def laxity(self, now: int) -> int:
         """Return the laxity of its next frame."""
         if self.deadline == NEVER:
             return NRT
         left = self.deadline - now
-        return rtcan.srt_laxity(left if not self.eased or left < -_STARVED else max(left, EASED * MILLISECOND))
+        return rtcan.srt_laxity(left if self.waiting[0].starved else max(left, self.floor * MILLISECOND))
 
 
 class LaxityQueue:
@@ -87,14 +94,18 @@ class LaxityQueue:
         self._depth = depth
         self._fifos: dict[int, _MessageFifo] = {}  # by message id
         self._sorted: list[tuple[int, int, _MessageFifo]] = []  # by deadline and order
-        self._eased: _MessageFifo | None = None  # the FIFO of this node's management, while it has only discovery
+        self.starved_apart = MILLISECOND
+        """Ns between two messages of discovery that are starved: those of all nodes together must not stop leases."""
+        self._starved_from = LONG_AGO
+        self._eased: _MessageFifo | None = None  # the FIFO of this node's management, while all of it has a floor
         self.size = 0
         """The number of waiting messages."""
         self._count = 0
         self._expiry = NEVER  # not later than the first message to drop, so that `expire` seldom looks at all FIFOs
 
     def put(self, message: QueuedMessage, *, urgent: bool = False, management: bool = False) -> bool:
-        """Queue a message; `urgent`: before those of its topic that have not started and may wait longer. False: full.
+        """Queue a message; `urgent`: before those of its topic that have not started and may wait longer; and there
+        is room for as many more of these. False: full.
 
         `management` does not count for the capacity, and goes before others of the same laxity, as on the bus: else
         events that are overdue but not dropped would stop leases and discovery. Raises `MessageError` for payloads that
@@ -103,7 +114,8 @@ class LaxityQueue:
         message.frames = rtcan.fragment_count(len(message.payload))
         fifo = self._fifos.get(message.message)
         # `depth`: one topic alone must not fill the queue.
-        if (self.size >= self._capacity and not management) or (fifo is not None and len(fifo.waiting) >= self._depth):
+        full = fifo is not None and len(fifo.waiting) >= self._depth * (2 if urgent else 1)
+        if full or (self.size >= self._capacity and not management):
             return False
         self._count += 1
         message.order = self._count - (_FIRST if management else 0)
@@ -113,7 +125,7 @@ class LaxityQueue:
         elif urgent:
             self._leave(fifo)
             fifo.deadline = min(fifo.deadline, message.deadline)
-            fifo.waiting.insert(self._place(fifo, message.deadline), message)
+            fifo.waiting.insert(self._place(fifo, message), message)
             self._enter(fifo)
         else:
             self._append(fifo, message)
@@ -145,14 +157,12 @@ class LaxityQueue:
             fifo = self._fifos.get(self.only)
             return fifo.waiting[0] if fifo is not None and not fifo.busy and fifo.held <= now else None
         best, eased = self._best(now, nrt=nrt), self._eased
-        if (
-            eased is None
-            or eased.busy
-            or eased.held > now
-            or (best is not None and best.laxity(now) < eased.laxity(now))
-        ):
+        if eased is None or eased.busy or eased.held > now:
             return None if best is None else best.waiting[0]
-        return eased.waiting[0]
+        if eased.deadline < now - _STARVED and self._starved_from <= now:
+            self._starved_from = now + self.starved_apart
+            eased.waiting[0].starved = True
+        return best.waiting[0] if best is not None and best.laxity(now) < eased.laxity(now) else eased.waiting[0]
 
     def _best(self, now: int, *, nrt: bool) -> _MessageFifo | None:
         """Return the FIFO to try now, without the eased one."""
@@ -161,7 +171,7 @@ class LaxityQueue:
         limit: int | None = None
         for entry in self._sorted:
             fifo = entry[2]
-            if fifo.busy or fifo.eased or fifo.held > now:
+            if fifo.busy or fifo is self._eased or fifo.held > now:
                 continue
             if chosen is None:
                 chosen = entry
@@ -285,16 +295,17 @@ class LaxityQueue:
             self._leave(fifo)
             fifo.deadline = message.deadline
             insort(self._sorted, (fifo.deadline, fifo.order, fifo))
-        fifo.eased = fifo.eased and message.eased
-        self._eased = fifo if fifo.eased else self._eased if self._eased is not fifo else None
+        self._set_floor(fifo, min(fifo.floor, message.floor))
         if message.expiry < fifo.expiry:
             fifo.expiry = message.expiry
             self._expiry = min(self._expiry, fifo.expiry)
 
-    def _place(self, fifo: _MessageFifo, deadline: int) -> int:
-        """Return the index for a message with this deadline: not before one that has started."""
+    def _place(self, fifo: _MessageFifo, message: QueuedMessage) -> int:
+        """Return the index for an urgent message: before those that may wait longer, but not one that has started."""
         started = fifo.busy or fifo.waiting[0].sent > 0
-        later = (place for place, each in enumerate(fifo.waiting) if each.deadline > deadline and place >= started)
+        urgency = message.floor, message.deadline
+        places = enumerate(fifo.waiting)
+        later = (place for place, each in places if (each.floor, each.deadline) > urgency and place >= started)
         return next(later, len(fifo.waiting))
 
     def _enter(self, fifo: _MessageFifo) -> None:
@@ -310,9 +321,15 @@ class LaxityQueue:
         if fifo.expiry < self._expiry:
             self._expiry = fifo.expiry
         insort(self._sorted, (fifo.deadline, fifo.order, fifo))
-        fifo.eased = first.eased and all(each.eased for each in waiting)
-        if fifo.eased:
+        self._set_floor(fifo, min(each.floor for each in waiting) if first.floor > SRT_MIN else SRT_MIN)
+
+    def _set_floor(self, fifo: _MessageFifo, floor: int) -> None:
+        """Set the least laxity of a FIFO; with one it competes apart from the others, which are sorted by deadline."""
+        fifo.floor = floor
+        if floor > SRT_MIN:
             self._eased = fifo
+        elif fifo is self._eased:
+            self._eased = None
 
 
 def _same_laxity_until(deadline: int, now: int) -> int:

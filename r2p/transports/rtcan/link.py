@@ -57,7 +57,7 @@ from r2p.transports.rtcan.tx import (
     inadmissible,
 )
 from r2p.transports.stats import LoggedCounter
-from r2p.units import LONG_AGO, MILLISECOND
+from r2p.units import LONG_AGO, MILLISECOND, SECOND
 
 _MANAGEMENT = MANAGEMENT.encode()
 _LOSSES = ("undecodable", "management dropped")  # what the engine counts as lost without a publisher of this module
@@ -69,8 +69,7 @@ _BIT = 1000  # ns at 1 Mbit/s
 _RATE_MIN = 1.0  # leases are longer then, as long as three rounds
 _FREE_SHARE = 0.5  # of the free slots, for the discovery of all modules together
 _FRAMES = 4  # of a message of discovery
-_WAITING_MAX = 16  # messages of this node, on a full bus: more of discovery would only be older when they are sent
-_HOLD = 50 * MILLISECOND
+_WAITING_MAX = 1  # messages of this node
 _RATE_STEP = 1.2  # by which the rate must differ before it is set anew
 _FIRMWARE_RATE, _FIRMWARE_QUIET = 12.0, 0.033  # a second, and s: all modules have one id, so none may send at once
 
@@ -222,9 +221,16 @@ class RtcanLink(BufferedLink):
         rate = min(self._rate_max, max(_RATE_MIN, part))
         if not self._rate / _RATE_STEP < rate < self._rate * _RATE_STEP:
             self._rate = rate
-            self._set_pace(rate, self._burst, 0.0)
-        if self.engine.management_waiting > _WAITING_MAX:
-            self._hold(self._clock.monotonic() + _HOLD)
+            self._set_pace(rate, round(self._burst * rate / self._rate_max), 0.0)
+            self.engine.set_discovery_rate(rate)
+        self._hold_discovery()
+
+    def _hold_discovery(self) -> None:
+        """Announce no more before what waits could be on the bus: it would only be older when it is sent."""
+        waiting = self.engine.management_waiting
+        if waiting > _WAITING_MAX:
+            frames = waiting * _FRAMES
+            self._hold(self._clock.monotonic() + round(frames * SECOND / max(self.engine.cycle.free_rate, frames)))
 
     def _announce(self) -> None:
         """Announce everything, under what may be another id8 than before."""
@@ -334,6 +340,8 @@ class RtcanLink(BufferedLink):
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         self.driver.carry_out(self._transmitter.send_management(data, urgent=urgent))
+        if not urgent:
+            self._hold_discovery()
 
     def _add_subscriber(self, name: str) -> None:
         if not self._transmitter.waits_for_response(name):

@@ -260,7 +260,9 @@ class SampleHandle(msgspec.Struct, eq=False):
 
 
 class ResponseHandle(msgspec.Struct, eq=False):
-    """A SUBSCRIBE_RESPONSE in the engine."""
+    """A SUBSCRIBE_RESPONSE in the engine, and its bytes."""
+
+    data: bytes
 
 
 class Transmitter:
@@ -274,6 +276,7 @@ class Transmitter:
         self._slotted = slotted
         self._frames = 0  # of non real-time messages in the engine
         self._messages = 0  # soft real-time ones in the engine
+        self._responses: dict[bytes, ResponseHandle] = {}  # in the engine
         self._response: ResponseHandle | None = None  # the last one, until it is on the bus
         self._awaited: dict[str, ResponseHandle] = {}  # by topic: the response that its subscribers need first
 
@@ -325,10 +328,17 @@ class Transmitter:
             self._report_missed(handle, done)
 
     def send_management(self, data: bytes, *, urgent: bool) -> Sequence[Action]:
-        """Send a management message, marked as r2p's if all modules have one id."""
+        """Send a management message, marked as r2p's if all modules have one id.
+
+        A response that waits already is not sent twice.
+        """
         handle = None  # only of a response its end is of interest
         if management.type_of(data) == ManagementType.SUBSCRIBE_RESPONSE and self._engine.ready:
-            handle = self._response = ResponseHandle()
+            waiting = self._responses.get(data)
+            handle = self._response = waiting or ResponseHandle(data)
+            if waiting is not None:
+                return ()
+            self._responses[data] = handle
         if self._engine.profile is Profile.FIRMWARE:
             data = management.mark(data)
         return self._engine.manage(self._driver.now(), data, urgent=urgent, handle=handle)
@@ -345,6 +355,7 @@ class Transmitter:
 
     def response_sent(self, response: ResponseHandle) -> list[str]:
         """Note that a response is on the bus, or lost. Return the topics that waited for it."""
+        self._responses.pop(response.data, None)
         if response is self._response:
             self._response = None
         topics = [topic for topic, awaited in self._awaited.items() if awaited is response]

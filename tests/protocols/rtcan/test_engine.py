@@ -220,3 +220,36 @@ def test_discovery_that_waits_already_is_not_sent_twice() -> None:
     assert engine.management_waiting == 2
     engine.manage(now, alive, handle="its fate matters")
     assert engine.management_waiting == 3
+
+
+def test_a_message_of_the_network_replaces_the_one_before_that_still_waits() -> None:
+    engine, now = ready_engine()
+    sender = engine.management
+    engine.manage(now, management.encode(management.Alive("A")))  # it has started, so it stays the first one
+    sender.send(now, management.Reserve(0x050A, 1, 1, 60))
+    sender.send(now, management.Reserve(0x060A, 2, 1, 60))
+    sender.send(now, management.Reserve(0x050A, 3, 1, 60))
+    sender.send(now, management.Grant(0x050B, 1, 1, 60, 5, 1, 7, 3000))
+    sender.send(now, management.Refuse(0x050B, 2, 4, 1, 60))
+    waiting = [management.decode(each.payload) for each in engine.transmitter.queue.messages()]
+    assert waiting[1:] == [
+        management.Refuse(0x050B, 2, 4, 1, 60),
+        management.Reserve(0x060A, 2, 1, 60),
+        management.Reserve(0x050A, 3, 1, 60),
+    ]
+
+
+def test_a_good_bye_stays_behind_what_was_said_before_it() -> None:
+    engine, now = ready_engine()
+    hello = management.Hello("A", 1, 0, 0, 5000)
+    leaving = management.Hello("A", 1, management.HELLO_LEAVING, 0, 5000)
+    said: list[management.Management] = [
+        management.Advertise("leds", 5),
+        management.Advertise("pwm", 2),
+        hello,
+        leaving,
+    ]
+    for message in said:
+        engine.manage(now, management.encode(message))
+    waiting = [management.decode(each.payload) for each in engine.transmitter.queue.messages()]
+    assert waiting == [said[0], hello, said[1], leaving]  # the first one has started

@@ -469,3 +469,46 @@ def test_leases_outlast_discovery_that_fills_all_free_slots() -> None:
     assert not owner.of(SlotsLost)
     said = [node for at, frame, node in bus.sent if at > since and not is_sync(frame) and node in talkers]
     assert len(said) > 1000, "discovery fills what is left"
+
+
+def test_leases_are_longer_where_few_slots_are_left_for_renewals() -> None:
+    bus = Bus()
+    owner, master = network(bus, 0, 1)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, CYCLE))
+    bus.run(SECOND)
+    assert owner.engine.periodics[TOPIC].lease == LEASE
+    for high in range(20, 20 + 57):  # one slot of each cycle is left
+        master.act(master.engine.reserve(master.now, high, 8, CYCLE))
+    bus.run(3 * SECOND)
+    lease = owner.engine.periodics[TOPIC].lease
+    assert LEASE < lease <= 4 * LEASE
+    since, asked = bus.now, []
+    bus.run(3 * lease)
+    assert not owner.of(SlotsLost)
+    for at, frame, node in bus.sent:  # the last frame of a message has its type
+        message = rtcan.message_of(frame.id)
+        if at > since and node is owner and not frame.id & rtcan.LEFT_MASK and rtcan.high_byte(message) == 1:
+            asked += [at] if frame.data[-1] == management.ManagementType.RENEW else []
+    assert len(asked) == pytest.approx(9, abs=1)
+
+
+def test_slots_that_management_needs_are_refused() -> None:
+    """Else no lease could be renewed, and all slots would be lost."""
+    bus = Bus()
+    owner, master = network(bus, 0, 1)
+    for high in range(20, 20 + 57):
+        master.act(master.engine.reserve(master.now, high, 8, CYCLE))
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, CYCLE))
+    bus.run(SECOND)
+    assert len(owner.of(SlotsGranted)) == 1
+    owner.act(owner.engine.reserve(owner.now, TOPIC + 1, 8, CYCLE))
+    bus.run(10 * SECOND)
+    (refused,) = owner.of(SlotsRefused)
+    assert refused.high == TOPIC + 1
+    assert "carry what keeps the others" in refused.reason
+    assert not owner.of(SlotsLost)
+    owner.act(owner.engine.release(owner.now, TOPIC))
+    bus.run(2 * SECOND)
+    assert [each.high for each in owner.of(SlotsGranted)] == [TOPIC, TOPIC + 1]

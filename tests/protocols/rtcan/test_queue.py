@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from r2p.codecs import rtcan
 from r2p.errors import MessageError
-from r2p.protocols.rtcan.queue import LaxityQueue, QueuedMessage
+from r2p.protocols.rtcan.queue import DISCOVERY, PRESENCE, REQUEST, LaxityQueue, QueuedMessage
 from r2p.units import NEVER
 from tests.can_vectors import CanCase, can_cases, payload
 
@@ -350,14 +350,14 @@ def test_recorded_queue(case: CanCase) -> None:
             assert frame.id >> 23 == min(max(remaining, 1), 62)
 
 
-def discovery(remaining: float, size: int = 1) -> QueuedMessage:
-    return QueuedMessage(1, bytes(size), NOW + int(remaining * MS), drop=False, eased=True)
+def discovery(remaining: float, size: int = 1, floor: int = DISCOVERY) -> QueuedMessage:
+    return QueuedMessage(1, bytes(size), NOW + int(remaining * MS), drop=False, floor=floor)
 
 
 def test_overdue_discovery_is_behind_what_is_nearly_overdue() -> None:
-    queue = filled(srt(2, 1.9), srt(3, 2.5), srt(4, 3.5))
+    queue = filled(srt(2, 3.9), srt(3, 4.5), srt(4, 5.5))
     assert queue.put(discovery(-3), management=True)
-    assert drain(queue) == [(2, 1, 0), (1, 2, 0), (3, 2, 0), (4, 3, 0)]
+    assert drain(queue) == [(2, 3, 0), (1, 4, 0), (3, 4, 0), (4, 5, 0)]
 
 
 def test_urgent_management_takes_discovery_before_it_along() -> None:
@@ -365,12 +365,12 @@ def test_urgent_management_takes_discovery_before_it_along() -> None:
     assert queue.put(discovery(-3, size=16), management=True)
     started = queue.best(NOW)
     assert started is not None
-    assert rtcan.laxity_of(queue.next_frame(started, NOW).id) == 2
+    assert rtcan.laxity_of(queue.next_frame(started, NOW).id) == DISCOVERY
     queue.frame_sent(started)
     assert queue.put(QueuedMessage(1, bytes(1), NOW, drop=False), urgent=True, management=True)
     assert drain(queue) == [(1, 1, 0), (1, 1, 0)]
     assert queue.put(discovery(-3), management=True)
-    assert drain(queue) == [(1, 2, 0)]
+    assert drain(queue) == [(1, DISCOVERY, 0)]
 
 
 def test_starved_discovery_gets_the_bus_from_events_that_are_not_dropped() -> None:
@@ -380,3 +380,38 @@ def test_starved_discovery_gets_the_bus_from_events_that_are_not_dropped() -> No
     queue = filled(srt(2, -2900, drop=False))
     assert queue.put(discovery(-2001), management=True)
     assert drain(queue) == [(1, 1, 0), (2, 1, 0)]
+
+
+def test_management_goes_by_its_least_laxity_before_its_deadline() -> None:
+    """What was said long ago is overdue, but a request for slots is before it, and a presence between the two."""
+    queue = filled()
+    assert queue.put(discovery(-900, size=16), management=True)
+    started = queue.best(NOW)
+    assert started is not None
+    queue.next_frame(started, NOW)
+    assert queue.put(discovery(-800, size=2), management=True)
+    assert queue.put(discovery(49, size=3, floor=PRESENCE), urgent=True, management=True)
+    assert queue.put(discovery(9, size=4, floor=REQUEST), urgent=True, management=True)
+    assert queue.put(discovery(9, size=5, floor=1), urgent=True, management=True)
+    queue.frame_sent(started)
+    assert [len(each.payload) for each in queue.messages()] == [16, 5, 4, 3, 2]
+
+
+def test_starved_discovery_goes_before_others_no_faster_than_it_may() -> None:
+    queue = filled()
+    queue.starved_apart = 500 * MS
+    for size in range(1, 5):
+        assert queue.put(discovery(-2001, size), management=True)
+    laxities = []
+    for at in range(0, 1000, 250):
+        message = queue.best(NOW + at * MS)
+        assert message is not None
+        laxities.append(rtcan.laxity_of(queue.next_frame(message, NOW + at * MS).id))
+        queue.frame_sent(message)
+    assert laxities == [1, DISCOVERY, 1, DISCOVERY]
+
+
+def test_a_queue_full_of_discovery_has_room_for_what_is_urgent() -> None:
+    queue = LaxityQueue(depth=2)
+    assert [queue.put(discovery(50), management=True) for _ in range(3)] == [True, True, False]
+    assert [queue.put(discovery(10, floor=1), urgent=True, management=True) for _ in range(3)] == [True, True, False]
