@@ -91,7 +91,8 @@ async def _node(node: r2p.Node, topics: Sequence[str], number: int, modules: int
         node.advertise(each, Eight, r2p.Periodic(PERIOD, Eight))
     for each in topics[(number + 1) % modules :: modules]:
         node.subscribe(each, Eight, callback=functools.partial(_note, arrived, each))
-    await asyncio.get_running_loop().create_future()
+    while True:
+        await node.spin()
 
 
 def _note(arrived: set[str], topic: str, message: Eight) -> None:
