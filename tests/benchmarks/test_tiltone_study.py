@@ -33,7 +33,7 @@ PERIOD = 1e6 * nodes.PERIOD
 
 @cache
 def outcome(**changes: Any) -> Outcome:
-    return one(Scenario(**{"after": 4.0, "duration": 0.3, **changes}))
+    return one(Scenario(**{"after": 2.0, "duration": 0.3, **changes}))
 
 
 def test_an_input_in_slots_is_never_older_than_two_periods_and_a_slot_and_others_are() -> None:

@@ -85,7 +85,7 @@ async def sink(node: r2p.Node) -> None:
     await asyncio.Event().wait()
 
 
-async def run(traffic: Traffic, *, loaded: bool, seconds: float = 4.0) -> Run:
+async def run(traffic: Traffic, *, loaded: bool, seconds: float = 2.0) -> Run:
     """A drive, with the bus filled to 150 % from half of the time on."""
     starts: list[int] = []
     errors: list[float] = []
