@@ -1,20 +1,29 @@
-"""A terminal for the commands of a page: each runs on a pseudo terminal, and its output is awaited, never slept for."""
+"""A terminal for the commands of a page: each runs on a pseudo terminal, and its output is awaited, never slept for.
+
+A plain `r2p ...` or `python FILE` is forked from a process that has imported r2p. Whatever needs a shell starts the
+script `r2p` itself, or Python.
+"""
 
 import os
 import re
 import select
+import shlex
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
 import msgspec
 
-PATIENCE = 30.0
-"""Seconds after which a command that has not printed what it should has failed."""
+from tests.fork_server import ForkedCommand
+
+PATIENCE = 120.0
+"""Seconds after which a command that has not printed what it should has failed, on however busy a machine."""
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\r")
 _SHELL = re.compile(r"[|;&<>$]")
+_FORKED = re.compile(r"(r2p|python \w+\.py)( [^|;&<>$`*~#\\]+)?")
 
 
 class Command(msgspec.Struct, frozen=True):
@@ -40,6 +49,25 @@ def _command(text: str) -> Command:
     return Command(line, shown, bool(ctrl_c))
 
 
+def _start(
+    command: str, terminal: int, directory: Path, environment: dict[str, str]
+) -> subprocess.Popen[bytes] | ForkedCommand:
+    if _FORKED.fullmatch(command):
+        program, *arguments = shlex.split(command)
+        script = [str(Path(sys.executable).with_name(program))] if program == "r2p" else []
+        return ForkedCommand([*script, *arguments], terminal, directory, environment)
+    direct = command if _SHELL.search(command) else f"exec {command}"
+    return subprocess.Popen(
+        ["/bin/sh", "-c", direct],
+        cwd=directory,
+        env=environment,
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
+        start_new_session=True,
+    )
+
+
 class Process:
     """A command on a terminal of its own."""
 
@@ -47,16 +75,7 @@ class Process:
         self.command = command
         self.printed = ""
         self._terminal, slave = os.openpty()
-        direct = command if _SHELL.search(command) else f"exec {command}"
-        self._process = subprocess.Popen(
-            ["/bin/sh", "-c", direct],
-            cwd=directory,
-            env=environment,
-            stdin=slave,
-            stdout=slave,
-            stderr=slave,
-            start_new_session=True,
-        )
+        self._process = _start(command, slave, directory, environment)
         os.close(slave)
 
     def expect(self, shown: re.Pattern[str]) -> None:

@@ -52,6 +52,7 @@ class Session:
         self._directory = directory
         self._replacements = replacements
         self._environment = {
+            **{name: value for name, value in os.environ.items() if name == "PYTHONPATH"},  # of a git worktree
             **environment,
             "PATH": f"{environment.get('PATH', '')}{binaries}:{os.environ['PATH']}",
             "HOME": str(directory),
