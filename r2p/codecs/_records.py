@@ -53,18 +53,23 @@ class Record(Generic[T]):
     def _packable(self, message: T, name: str, kind: str) -> int | bytes:
         """Return the value of an attribute, checked: `struct` itself would cut and pad bytes without an error."""
         value: int | str | bytes = getattr(message, name)
-        where = f"{self.cls.__name__}.{name} = {value!r}"
-        if isinstance(value, int):
-            _check_int(where, kind, value)
-            return value
         size = struct.calcsize(kind)
+        if isinstance(value, int):
+            try:
+                struct.pack("<" + kind, value)
+            except struct.error:
+                raise self._error(name, value, f"takes {size} unsigned bytes") from None
+            return value
         if isinstance(value, bytes):
             if len(value) != size:
-                raise MessageError(f"{where}: takes {size} bytes, not {len(value)}")
+                raise self._error(name, value, f"takes {size} bytes, not {len(value)}")
             return value
         if not (value or name in self._may_be_empty) or len(value) > size or not _is_plain(value):
-            raise MessageError(f"{where}: takes a name of 1 to {size} printable ASCII characters")
+            raise self._error(name, value, f"takes a name of 1 to {size} printable ASCII characters")
         return value.encode()
+
+    def _error(self, name: str, value: int | str | bytes, what: str) -> MessageError:
+        return MessageError(f"{self.cls.__name__}.{name} = {value!r}: {what}")
 
     def _name(self, name: str, field: bytes) -> str:
         text = field.partition(b"\0")[0].decode("latin-1")
@@ -106,10 +111,3 @@ class Codec(Generic[T]):
 
 def _is_plain(text: str) -> bool:
     return text.isascii() and text.isprintable()
-
-
-def _check_int(where: str, kind: str, value: int) -> None:
-    try:
-        struct.pack("<" + kind, value)
-    except struct.error:
-        raise MessageError(f"{where}: takes {struct.calcsize(kind)} unsigned bytes") from None

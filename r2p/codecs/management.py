@@ -112,6 +112,16 @@ ORDER_TYPES = (ManagementType.STOP, ManagementType.REBOOT, ManagementType.BOOTLO
 """The orders that a gateway may deny."""
 GATEWAY_TYPES = (ManagementType.BRIDGE, ManagementType.MESH, ManagementType.LEAF)
 """The types of messages between gateways about their tree."""
+TOPIC_TYPES = frozenset(
+    {
+        ManagementType.ADVERTISE,
+        ManagementType.SUBSCRIBE_REQUEST,
+        ManagementType.SUBSCRIBE_RESPONSE,
+        ManagementType.TYPE,
+        ManagementType.ENDPOINT,
+    }
+)
+"""The types of messages about topics, which concern discovery only."""
 SEALED_TYPES = (*ORDER_TYPES, *GATEWAY_TYPES)
 """The types that count on a link with a key only behind their SEAL."""
 
@@ -477,8 +487,12 @@ _CODEC = Codec[Management](
 )
 
 
+@functools.lru_cache(maxsize=4096)
 def encode(message: Management) -> bytes:
-    """Encode a message to 32 bytes. Raises `MessageError`, which names the field, for a value that does not fit."""
+    """Encode a message to 32 bytes. Raises `MessageError`, which names the field, for a value that does not fit.
+
+    It is cached, as modules repeat themselves.
+    """
     if isinstance(message, SubscribeRequest) and not message.queue:
         raise MessageError("SubscribeRequest.queue = 0 halts firmware: ask for 1 or more messages")
     return _CODEC.encode(message)

@@ -16,6 +16,7 @@ from typing import ClassVar, Protocol
 import msgspec
 
 from r2p.clock import Alarm
+from r2p.codecs import management
 from r2p.codecs.management import NO_PARAMS, QUEUE
 from r2p.keys import SharedKey
 from r2p.messages import ClockOffset, Message
@@ -257,6 +258,23 @@ class Link(abc.ABC):
         """Return what seals and what they seal have in common: the address they come from."""
         return source
 
+    def manage_all(self, messages: Iterable[bytes], source: Hashable) -> None:
+        """Handle management messages that came together; what they cause comes after the last one."""
+        now, receive, is_open = self._clock.monotonic(), self.discovery.receive, self.guard is None
+        acting, self._acting = self._acting, True
+        try:
+            for data in messages:
+                try:
+                    if is_open and management.type_of(data) in management.TOPIC_TYPES:  # as almost all
+                        self._events += receive(now, data, source)
+                    else:
+                        self.manage(data, source)
+                except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
+                    self.stats.lost.internal_error(error)
+        finally:
+            self._acting = acting
+        self._apply(())
+
     def handle_management(self, data: bytes, source: Hashable) -> None:
         """Handle a management message that counts, also on a link with a key."""
         if self.gateway_hooks is None or not self.gateway_hooks.handle_management(data):
@@ -274,6 +292,10 @@ class Link(abc.ABC):
     @abc.abstractmethod
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         """Send a management message before waiting samples, `urgent` ones before all; lost if nothing moves."""
+
+    def write_answer(self, data: bytes, to: Hashable) -> None:
+        """Send a management message to one address; only where discovery was told that addresses are possible."""
+        raise NotImplementedError
 
     @abc.abstractmethod
     def write_call(self, data: bytes, to: Hashable) -> None:
@@ -494,16 +516,23 @@ class Link(abc.ABC):
                 self.stats.lost.guard(self._act, self._events.popleft())
         finally:
             self._acting = False
+        self._acted()
         if not self._closed:
             self._alarm.set(self.discovery.next_deadline())
             if self.gateway_hooks is not None:
                 self.stats.lost.guard(self.gateway_hooks.discovery_changed)
 
+    def _acted(self) -> None:
+        """Send what waits for the end of a turn of discovery."""
+
     def _act(self, event: Event) -> None:
         match event:
-            case Send(data, urgent):
+            case Send(data, urgent, to):
                 if self.up and (self.gateway_hooks is None or self.gateway_hooks.may_announce):
-                    self.send_management(data, urgent=urgent)
+                    if to is None:
+                        self.send_management(data, urgent=urgent)
+                    else:
+                        self.write_answer(data, to)
             case SubscriberJoined():
                 self._subscriber_joined(event)
             case SubscribersGone(topic) if self.up or self._closed:

@@ -29,6 +29,7 @@ from r2p.transports.url import Url, duration, key_file
 IN_FLIGHT = 1024
 """Places for messages on their way, without which the network is full for senders."""
 
+_MANAGEMENT = MANAGEMENT.encode()
 _PLACE = 64 * 1024
 """Bytes of a message in each place: so what is on its way has 64 MiB at most, and one message more."""
 
@@ -48,22 +49,41 @@ class Datagram(msgspec.Struct, frozen=True, gc=False):
     stamped: bool = True
     hops: int = 0
     clock: ClockOffset | None = None
+    together: tuple[bytes, ...] = ()
+    """Management messages that travel as one, instead of `data`."""
 
 
 class MemoryPort:
     """A socket on a network. While its reader pauses, it holds messages: they are still on their way.
 
-    `made_room` is called when the network is no longer full.
+    `made_room` is called when the network is no longer full, `faults_changed` when it begins or ceases to have faults.
+    `takes_together`: `receive` takes several management messages in one.
     """
 
     def __init__(
-        self, network: "MemoryNetwork", receive: Callable[[Datagram], None], made_room: Callable[[], None]
+        self,
+        network: "MemoryNetwork",
+        receive: Callable[[Datagram], None],
+        made_room: Callable[[], None],
+        faults_changed: Callable[[], None] = lambda: None,
+        *,
+        takes_together: bool = False,
     ) -> None:
         self.network = network
-        self.receive = receive
         self.made_room = made_room
+        self.faults_changed = faults_changed
+        self._receive = receive
+        self._takes_together = takes_together
         self.held: deque[Datagram] = deque()
         self.paused = False
+
+    def receive(self, datagram: Datagram) -> None:
+        """Hand on a message."""
+        if not datagram.together or self._takes_together:
+            self._receive(datagram)
+        else:
+            for data in datagram.together:
+                self._receive(Datagram(datagram.port, datagram.topic, data))
 
     def resume(self) -> None:
         """Hand on held messages."""
@@ -74,13 +94,39 @@ class MemoryPort:
             self.receive(datagram)
 
 
+class _Fault:
+    """A fault of a network, an attribute that its ports learn of when it changes."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, network: "MemoryNetwork", owner: type) -> float:
+        return network.faults.get(self._name, 0.0)
+
+    def __set__(self, network: "MemoryNetwork", value: float) -> None:
+        before = bool(network.faults)
+        network.faults.pop(self._name, None)
+        if value:
+            network.faults[self._name] = value
+        if bool(network.faults) != before:
+            network.faults_changed()
+
+
 class MemoryNetwork:
     """A network of this process, and its faults: probabilities 0..1, `delay` and `jitter` in seconds.
 
     `reorder` is the probability that a message is held back long enough for the next ones to overtake it. Faults can be
     changed at any time; `counts` shows what happened. Without a `seed`, the event loop provides one at the first fault
     (under virtual time that of the test).
+
+    While there are no faults, modules answer each other one by one, and what they announce travels together.
     """
+
+    loss = _Fault()
+    duplicate = _Fault()
+    reorder = _Fault()
+    delay = _Fault()
+    jitter = _Fault()
 
     def __init__(
         self,
@@ -94,6 +140,9 @@ class MemoryNetwork:
     ) -> None:
         check_seconds("the delay of a memory network", delay, least=0.0)
         check_seconds("the jitter of a memory network", jitter, least=0.0)
+        self.faults: dict[str, float] = {}
+        """The present faults by name, without those that are 0."""
+        self._ports: dict[int, MemoryPort] = {}
         self.loss = loss
         self.duplicate = duplicate
         self.reorder = reorder
@@ -102,7 +151,6 @@ class MemoryNetwork:
         self.seed = seed
         self.counts: Counter[str] = Counter()
         self._random: random.Random | None = None
-        self._ports: dict[int, MemoryPort] = {}
         self._addresses = 0
         self._in_flight = 0
 
@@ -130,7 +178,7 @@ class MemoryNetwork:
     def send(self, datagram: Datagram) -> None:
         """Send to all other ports."""
         others = [address for address in self._ports if address != datagram.port]
-        if self._has_faults():
+        if self.faults:
             for address in others:
                 self._send_to(address, datagram)
         else:
@@ -142,6 +190,11 @@ class MemoryNetwork:
         if address in self._ports:
             self._send_to(address, datagram)
 
+    def faults_changed(self) -> None:
+        """Tell all ports that the network begins or ceases to have faults."""
+        for port in list(self._ports.values()):
+            port.faults_changed()
+
     def release(self, places: int) -> None:
         """Note that messages are no longer on their way."""
         was_full = self.full
@@ -149,9 +202,6 @@ class MemoryNetwork:
         if was_full and not self.full:
             for port in list(self._ports.values()):
                 port.made_room()
-
-    def _has_faults(self) -> bool:
-        return bool(self.loss or self.duplicate or self.reorder or self.delay or self.jitter)
 
     def _send_to(self, address: int, datagram: Datagram) -> None:
         if self._happens(self.loss):
@@ -226,12 +276,22 @@ class MemoryLink(BufferedLink):
         super().__init__(name, hub)
         self.network = network
         self._address = network.new_address()
-        self._port = MemoryPort(network, lambda datagram: self.receive((datagram,)), self.made_room)
+        self._port = MemoryPort(
+            network,
+            lambda datagram: self.receive((datagram,)),
+            self.made_room,
+            self._review_faults,
+            takes_together=True,
+        )
+        self._together: list[bytes] = []
+        """Management messages of this turn, which go to the same address, or to all."""
+        self._to: Hashable = None
         self._times_left = TimesLeft()
 
     def connect(self) -> None:
         """Plug the link in."""
         self.network.plug_in(self._address, self._port)
+        self._review_faults()
         self.on_up()
 
     def disconnect(self, reason: str = "unplugged") -> None:
@@ -244,6 +304,7 @@ class MemoryLink(BufferedLink):
         return self.network.full
 
     def write(self, topic: str, sample: Sample) -> None:
+        self._send_together()
         self.stats.sent += 1
         self.stats.bytes_sent += len(sample.data)
         hooks = self.gateway_hooks
@@ -268,10 +329,52 @@ class MemoryLink(BufferedLink):
             self.network.send(datagram)
 
     def write_call(self, data: bytes, to: Hashable) -> None:
+        self._send_together()
         self.network.send(Datagram(self._address, own_services.topic_of(data), data))
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        self.network.send(Datagram(self._address, MANAGEMENT.encode(), data))
+        self._write_together(data, None)
+
+    def write_answer(self, data: bytes, to: Hashable) -> None:
+        self._write_together(data, to)
+
+    def _write_together(self, data: bytes, to: Hashable) -> None:
+        """Send a management message together with others that are caused by the same events, or at once."""
+        if to != self._to:
+            self._send_together()
+        self._to = to
+        self._together.append(data)
+        if not self._acting:
+            self._send_together()
+
+    def _send_together(self) -> None:
+        messages, self._together = self._together, []
+        if len(messages) > 1 and not self.network.faults:  # which are faults of single messages
+            self._send_management(Datagram(self._address, _MANAGEMENT, b"", together=tuple(messages)))
+        else:
+            for data in messages:
+                self._send_management(Datagram(self._address, _MANAGEMENT, data))
+
+    def _send_management(self, datagram: Datagram) -> None:
+        if isinstance(self._to, int):
+            self.network.send_to(self._to, datagram)
+        else:
+            self.network.send(datagram)
+
+    def _acted(self) -> None:
+        if self._together:
+            self._send_together()
+
+    def _review_faults(self) -> None:
+        """Repeat little, and answer each module alone, while nothing is lost; with a key, all hear what it seals."""
+        self.discovery.set_lossless(not self.network.faults, addresses=self.guard is None)
+        self._apply(())
+
+    def receive_other(self, arrival: Datagram) -> None:
+        if arrival.together:
+            self.manage_all(arrival.together, arrival.port)
+        else:
+            super().receive_other(arrival)
 
     def sample(self, topic: str, arrival: Datagram) -> Sample:
         self.stats.bytes_received += len(arrival.data)

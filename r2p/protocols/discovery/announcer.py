@@ -3,7 +3,7 @@
 The schedule holds keys only. The announcer makes the messages of a key in its turn, from the present state.
 """
 
-from collections import Counter
+from collections import Counter, deque
 
 import msgspec
 
@@ -20,7 +20,7 @@ from r2p.codecs.management import (
 )
 from r2p.protocols.discovery.aliases import LinkNames
 from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory, decrement
-from r2p.protocols.discovery.events import Outbox, TopicType
+from r2p.protocols.discovery.events import Outbox, PeerAddress, TopicType
 from r2p.protocols.discovery.schedule import Item, ItemKind, Schedule
 from r2p.units import MILLISECOND
 from r2p.version import __version__
@@ -33,6 +33,8 @@ _KindName = tuple[int, str]
 
 _HELLO_EACH = 3
 """Presences in a crowd of which one has a HELLO: ALIVE extends the lease as well."""
+_ANSWERS_AT_ONCE = 64
+"""Items said to one module in one turn."""
 _KIND_OF_ROLE = {ROLE_PUBLISHES: ItemKind.PUBLISHER, ROLE_SUBSCRIBES: ItemKind.SUBSCRIBER}
 
 
@@ -89,6 +91,8 @@ class Announcer:
         """Topics whose names are announced, also while the link does not carry them as another one has the alias."""
         self._long_names: Counter[_KindName] = Counter()
         """Names that travel as aliases, and how many announcements have each."""
+        self._answers: dict[PeerAddress, deque[Item]] = {}
+        """What is still to be said to modules that have asked, by address."""
         schedule.is_settled = self._is_settled
         self._hello_in = 0
         """Presences until the next HELLO in a crowd."""
@@ -161,6 +165,16 @@ class Announcer:
         """Repeat everything soon, as a module on the link is new, or asks for it; `tool`: it shows all to a user."""
         self._hello_in = 0
         self._schedule.repeat(now, self._directory.r2p_modules, tool=tool)
+
+    def answer(self, source: PeerAddress) -> None:
+        """Say everything to one module that asks, where that is possible and arrives. What is to be announced for the
+        first time is not said twice.
+        """
+        self._answers[source] = deque([Item(ItemKind.QUERY), *self._schedule.announced()])
+
+    @property
+    def has_answers(self) -> bool:
+        return bool(self._answers)
 
     def relay(self, message: Relayed) -> None:
         """Pass on a message of another module from another link, as soon as the rate allows."""
@@ -240,13 +254,32 @@ class Announcer:
     def _name_messages(self, kind: int, name: str) -> list[management.LongName]:
         return management.long_name_messages(kind, self._names.text(kind, name))
 
+    def link_down(self) -> None:
+        """Stop, until the link is up again."""
+        self._answers.clear()
+        self._schedule.stop()
+
     def flush(self, now: int) -> None:
-        """Send due announcements."""
+        """Send due announcements, and a part of the answers."""
+        if self._answers:
+            self._answer_one()
         while self.outbox.up and (item := self._schedule.pop(now)) is not None:
             messages = self._messages(item)
             if messages:
                 self.outbox.send(*messages)
                 self._schedule.sent(now, len(messages))
+
+    def _answer_one(self) -> None:
+        """Say to one of those that have asked what fits into a turn."""
+        source, items = next(iter(self._answers.items()))
+        for _ in range(min(len(items), _ANSWERS_AT_ONCE)):
+            item = items.popleft()
+            if item.kind is ItemKind.QUERY:
+                self.outbox.send(*self._introduction(), to=source)
+            elif item in self._schedule:  # else it has ended meanwhile
+                self.outbox.send(*self._messages(item), to=source)
+        if not items:
+            del self._answers[source]
 
     # The messages
 
@@ -308,7 +341,11 @@ class Announcer:
 
     def _presence(self, flags: int) -> list[management.Management]:
         # First the HELLO: after an ALIVE alone the module would be taken for firmware.
-        hello = [] if self._is_known() and not flags else [self.hello(flags)]
+        return self._introduction(flags) if flags or not self._is_known() else self._introduction(None)
+
+    def _introduction(self, flags: int | None = 0) -> list[management.Management]:
+        """Return what shows that the module is there; without HELLO if its flags are None."""
+        hello = [] if flags is None else [self.hello(flags)]
         alive = [] if self._observer else [management.Alive(self.module, self.flags)]
         return [*management.alias_messages(self.module), *hello, *alive]
 

@@ -35,7 +35,7 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 
-class TopicInfo(msgspec.Struct):
+class TopicInfo(msgspec.Struct, gc=False):
     """A topic on the link. Instants are in monotonic ns, None: never; `size` is in bytes, 0: unknown, a bound if the
     length `varies`.
 
@@ -118,6 +118,8 @@ class Directory:
         """Counts of what was dropped on this link, by reason."""
         self.is_lossless = False
         """Whether all that is sent arrives, for as long as the link is up."""
+        self.has_addresses = False
+        """Whether the link can send to one module alone, and loses nothing."""
         self._direct: dict[PeerAddress, dict[str, ModuleInfo]] = {}
         self._leases: dict[PeerAddress, Counter[int]] = {}
         self._names: dict[int, str] = {}
@@ -253,13 +255,14 @@ class Directory:
     def add_type(self, now: int, topic: str, role: int, said: TopicType) -> TopicInfo:
         """Enter the type from a peer. Of several different ones the first stays, as long as it is repeated."""
         info = self.touch_topic(topic)
-        for each in [each for each, at in info.typed_at.items() if now > at + LEASE]:
-            del info.typed_at[each]
-            info.set_type(each, None)
+        if info.typed_at and now > min(info.typed_at.values()) + LEASE:
+            for each in [each for each, at in info.typed_at.items() if now > at + LEASE]:
+                del info.typed_at[each]
+                info.set_type(each, None)
         known = info.types.get(role, _UNKNOWN)
         if said == known and role in info.typed_at:  # as almost always
             info.typed_at[role] = now
-        elif said != _UNKNOWN and known.fits(said):
+        elif said != _UNKNOWN and known.fits(said) and not known.covers(said):
             if known.fingerprint in {management.ANY_TYPE, said.fingerprint}:
                 info.typed_at[role] = now
             info.set_type(role, known.merged(said))

@@ -34,7 +34,7 @@ COMMAND_OF_TYPE: dict[int, Command] = dict(zip(management.ORDER_TYPES, MESSAGE_O
 """The command by the type byte of its message: `management.order_type`."""
 
 
-class TopicType(msgspec.Struct, frozen=True):
+class TopicType(msgspec.Struct, frozen=True, gc=False):
     """The type of a topic as far as it is known: payload bytes (0: unknown) and fingerprint (`ANY_TYPE`: unknown).
 
     If the length `varies`, `size` is a bound, which need not be the same in all modules. A subscriber that accepts
@@ -72,6 +72,11 @@ class TopicType(msgspec.Struct, frozen=True):
         typed = self.fingerprint != management.ANY_TYPE and other.fingerprint != management.ANY_TYPE
         return not typed or self.fingerprint == other.fingerprint
 
+    def covers(self, other: "TopicType") -> bool:
+        """Return whether a type that fits says nothing new: only its size."""
+        is_size = other.fingerprint == management.ANY_TYPE != self.fingerprint
+        return is_size and other.size == self.size and other.varies == self.varies
+
     def merged(self, other: "TopicType") -> "TopicType":
         """Return what is known from either of two types that fit."""
         typed = self.fingerprint != management.ANY_TYPE
@@ -79,7 +84,7 @@ class TopicType(msgspec.Struct, frozen=True):
         return TopicType(known.size, self.fingerprint if typed else other.fingerprint, known.varies)
 
 
-class ModuleInfo(msgspec.Struct, frozen=True):
+class ModuleInfo(msgspec.Struct, frozen=True, gc=False):
     """A module on the link.
 
     `flags` are those of its ALIVE, `last_heard` is in monotonic ns. Only an r2p module has an `instance` (the random
@@ -125,10 +130,11 @@ def possible_senders(modules: Iterable[ModuleInfo]) -> set[str]:
 
 
 class Send(msgspec.Struct, frozen=True):
-    """Send these 32 bytes on the topic `R2P`, `urgent` ones before everything else."""
+    """Send these 32 bytes on the topic `R2P`, `urgent` ones before everything else; `to` one address, or to all."""
 
     data: bytes
     urgent: bool = False
+    to: PeerAddress = None
 
 
 class SubscriberJoined(msgspec.Struct, frozen=True):
@@ -350,12 +356,12 @@ class Outbox:
         self._events: list[Event] = []
         self._sent: deque[bytes] = deque(maxlen=_SENT_MAX)
 
-    def send(self, *messages: management.Management, urgent: bool = False) -> None:
+    def send(self, *messages: management.Management, urgent: bool = False, to: PeerAddress = None) -> None:
         if self.up:
             for message in messages:
                 data = management.encode(self._to_wire(message))
                 self._sent.append(data)
-                self._events.append(Send(data, urgent))
+                self._events.append(Send(data, urgent, to))
 
     def emit(self, *events: Event) -> None:
         self._events += events

@@ -221,7 +221,11 @@ class PeerLiveness:
             self._negotiation.module_found(now, info, is_new=is_new)
         self._enter(now, before, info)
         # After `_enter`: the rate of repetition depends on the number of modules.
-        if is_new or message.flags & management.HELLO_QUERY:
+        asks = bool(message.flags & management.HELLO_QUERY)
+        if self._directory.has_addresses and message.hops == 0:  # there each new module asks
+            if asks:
+                self._announcer.answer(source)
+        elif is_new or asks:
             self._announcer.repeat_all(now, tool=bool(message.flags & management.HELLO_TOOL))
 
     def _look_for_namesakes(self, now: int, before: ModuleInfo | None, message: management.Hello) -> None:

@@ -30,7 +30,7 @@ from r2p.protocols.discovery.events import (
 )
 from r2p.units import MILLISECOND, SECOND
 
-M = TypeVar("M")
+M = TypeVar("M", management.Advertise, management.SubscribeRequest)
 
 _SENT_BY_R2P = (UNANSWERED, ANSWERED)
 
@@ -119,7 +119,7 @@ class SubscriptionNegotiation:
         if own is None or peer is None:
             return
         # Firmware is asked at once and every time: it may have restarted without notice.
-        if peer.is_r2p(now) and (_receives(peer, message) or self._offers.defer(now, topic, source, message)):
+        if peer.is_r2p(now) and (_receives(peer, message) or self._defer(now, self._offers, message, source)):
             return
         self._send_request(now, topic, own, [(peer, message)])
 
@@ -132,7 +132,7 @@ class SubscriptionNegotiation:
         if own is None or peer is None:
             return
         r2p = peer.is_r2p(now) or message.params in _SENT_BY_R2P  # its HELLO may be later than its request
-        if not (r2p and self._requests.defer(now, topic, source, message)):
+        if not (r2p and self._defer(now, self._requests, message, source)):
             self._send_response(now, topic, own, [(peer, message)])
 
     def responded(self, now: int, message: management.SubscribeResponse, source: PeerAddress) -> None:
@@ -177,6 +177,10 @@ class SubscriptionNegotiation:
 
     # Answers
 
+    def _defer(self, now: int, answers: "SharedAnswers[M]", message: M, source: PeerAddress) -> bool:
+        """Decide whether to answer an r2p module later, together with others: not where each is answered alone."""
+        return not self._directory.has_addresses and answers.defer(now, message.topic, source, message)
+
     def answer(self, now: int, role: int, topic: str) -> None:
         """Answer all r2p modules that have said since the last answer that they publish or subscribe to the topic."""
         own = self._counterpart(role).get(topic)
@@ -189,6 +193,10 @@ class SubscriptionNegotiation:
             if own is not None and requests:
                 self._send_response(now, topic, own, requests)
 
+    def _address(self, asked: list[tuple[Peer, M]]) -> PeerAddress:
+        """Return to whom an answer goes: to the one that asked, where that is possible and arrives; None: to all."""
+        return asked[0][0].source if self._directory.has_addresses and len(asked) == 1 else None
+
     def _with_peers(self, asked: list[tuple[PeerAddress, M]]) -> list[tuple[Peer, M]]:
         return [(peer, message) for source, message in asked if (peer := self._peers.get(source)) is not None]
 
@@ -198,26 +206,29 @@ class SubscriptionNegotiation:
         """Request the messages of publishers, but for those of r2p that have responded meanwhile."""
         r2p = [peer.is_r2p(now) for peer, _ in offers]
         offers = [each for each, is_r2p in zip(offers, r2p, strict=True) if not (is_r2p and _receives(*each))]
+        to = self._address(offers)
         if any(r2p) and offers:  # before the request: publishers compare it with theirs when they respond
-            self._outbox.send(own.type_info(topic, ROLE_SUBSCRIBES))
+            self._outbox.send(own.type_info(topic, ROLE_SUBSCRIBES), to=to)
         sizes = [
             offer.size for peer, offer in offers if self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, offer))
         ]
         if sizes:
-            self._outbox.send(*self._own.requests(topic, own, sizes[-1]))
-            self._own.await_response(topic)
+            self._outbox.send(*self._own.requests(topic, own, sizes[-1]), to=to)
+            if to is None:
+                self._own.await_response(topic)
 
     def _send_response(
         self, now: int, topic: str, own: LocalTopic, requests: list[tuple[Peer, management.SubscribeRequest]]
     ) -> None:
         """Respond to subscribers, and attach those that are new."""
+        to = self._address(requests)
         if any(_needs_type(now, peer, request) for peer, request in requests):
-            self._outbox.send(own.type_info(topic, ROLE_PUBLISHES))
+            self._outbox.send(own.type_info(topic, ROLE_PUBLISHES), to=to)
         requests = [each for each in requests if self._may_subscribe(*each, own.type)]
         if not requests:
             return
         queue = max(requests[-1][1].queue, 1)  # a request with 0, at which firmware halts, is answered with 1
-        self._outbox.send(management.SubscribeResponse(topic, own.type.size_field, queue, own.params))
+        self._outbox.send(management.SubscribeResponse(topic, own.type.size_field, queue, own.params), to=to)
         for peer, request in requests:
             unanswered = peer.is_r2p(now) and request.params == UNANSWERED
             if self._add_subscriber(now, peer, topic, unanswered=unanswered):

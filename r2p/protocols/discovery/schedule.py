@@ -39,6 +39,8 @@ _PRESENCE_SHARE = 8
 """The same in message times: on a slow line, presences would leave no room for anything else."""
 _PRESENCE_HELD = SECOND // 2
 """Ns for which a presence waits at most while all is held back."""
+_TURNS = 2
+"""How often everything is announced before it is repeated slowly: an answer may be lost."""
 _QUIET_MAX = SECOND
 """Ns that a step waits at most for a line to be quiet."""
 _ITEM_MESSAGES = 2
@@ -127,6 +129,7 @@ class Schedule:
         self._rounds = SLOW_ROUNDS
         self.is_settled: Callable[[Item], bool] = lambda item: True
         """Whether a topic waits for no answer; called for those of a crowd."""
+        self._turns = _TURNS
 
     def hold(self, until: int) -> None:
         """Let nothing go before this instant (ns), but for presences that are overdue."""
@@ -137,10 +140,19 @@ class Schedule:
         self._bucket = self._bucket.changed(rate, max(burst, _ITEM_MESSAGES))
         self._quiet = quiet
 
+    def set_lossless(self, *, lossless: bool) -> None:
+        """Announce everything once before it is repeated slowly, instead of twice, while nothing is lost."""
+        if self._turns != 1 and lossless:
+            self._turns = 1
+        elif self._turns == 1 and not lossless:
+            self._turns = _TURNS
+            self._hurry()
+
     def set_crowd(self, modules: int) -> None:
         """Repeat topics slowly, as so many modules of r2p are on the link; 0: as usual."""
         if modules and not self._crowd:
-            self._lap = max(self._lap, 1)  # from the next step on
+            # From the next step on; where nothing is lost, all was announced to those that are there.
+            self._lap = max(self._eager if self._turns == 1 else self._lap, 1)
         elif self._crowd and not modules:
             self._include_slow()
         self._crowd = modules
@@ -151,7 +163,7 @@ class Schedule:
         if item in self._slow:
             del self._slow[item]
             self._ring[item] = None
-            self._lap = max(self._lap, 2 * len(self._ring))
+            self._lap = max(self._lap, self._turns * len(self._ring))
 
     def add(self, item: Item) -> None:
         """Announce an item as soon as the rate allows, and unless `once` for ever. A waiting one keeps its turn."""
@@ -227,8 +239,7 @@ class Schedule:
         if self._fresh and now - self._presence_at < _ROUND:  # a thousand new topics outlast the lease of the module
             item, _ = self._fresh.popitem(last=False)
             if not item.once:
-                self._ring[item] = None
-                self._lap = max(self._lap, len(self._ring))
+                self._announced(item)
             return item
         # In turn, so that neither this module nor those of other links starve.
         if self._relayed and (self._relay_next or self._turn_at() > now):
@@ -242,6 +253,14 @@ class Schedule:
         if presence:
             return self._presence(now)
         return self._repetition()
+
+    def announced(self) -> list[Item]:
+        """Return what is repeated, but for items that still wait for their first turn; names come first."""
+        there = [*self._slow, *list(self._ring)[self._eager :]]
+        return sorted(there, key=lambda item: item.kind is not ItemKind.LONG_NAME)
+
+    def __contains__(self, item: Item) -> bool:
+        return item in self._slow or item in self._ring or item in self._fresh
 
     def sent(self, now: int, count: int) -> None:
         self._bucket.spend(now, count)
@@ -289,9 +308,9 @@ class Schedule:
         self._hurry()
 
     def _hurry(self) -> None:
-        """Announce everything without waiting, and once more in the next turn: an answer may be lost."""
+        """Announce everything without waiting, and once more in the next turn if an answer may be lost."""
         self._include_slow()
-        self._eager, self._lap = self._count, 2 * self._count
+        self._eager, self._lap = self._count, self._turns * self._count
 
     def _include_slow(self) -> None:
         """Announce everything in the next turn, first the names behind aliases, as all others travel as these."""
@@ -321,10 +340,20 @@ class Schedule:
             self._slow_down()
         return item
 
+    def _announced(self, item: Item) -> None:
+        """Enter a new item into a ring, as it is announced for the first time."""
+        if self._turns == 1 and self._is_slow(item):
+            self._slow[item] = None
+        else:
+            self._ring[item] = None
+            self._lap = max(self._lap, len(self._ring))
+
+    def _is_slow(self, item: Item) -> bool:
+        return item.kind in _DESCRIBING or (self._crowd > 0 and self.is_settled(item))
+
     def _slow_down(self) -> None:
-        """Move endpoints and names to the slow ring, once everything was announced twice; in a crowd also topics."""
-        slow = [item for item in self._ring if item.kind in _DESCRIBING or (self._crowd and self.is_settled(item))]
-        for item in slow:
+        """Move endpoints and names to the slow ring, as everything was announced; in a crowd also topics."""
+        for item in [item for item in self._ring if self._is_slow(item)]:
             del self._ring[item]
             self._slow[item] = None
         if self._crowd:

@@ -108,10 +108,11 @@ class DiscoveryProtocol(ABC):
         """Return the address of an r2p module on the link itself; None if it is not known, or behind a gateway."""
         return None
 
-    def set_lossless(self) -> None:
-        """Note that all that is sent arrives, for as long as the link is up: little needs to be repeated.
+    def set_lossless(self, lossless: bool = True, *, addresses: bool = False) -> None:
+        """Note whether all that is sent arrives, for as long as the link is up: then little needs to be repeated.
 
-        Nothing is to be done where nothing is repeated, anyway.
+        `addresses`: the link can also send to one module alone, so that one who asks is answered alone. Nothing is to
+        be done where nothing is repeated, anyway.
         """
 
     def refresh_ages(self, now: int) -> None:
@@ -479,8 +480,11 @@ class Discovery(DiscoveryProtocol):
         """
         self._schedule.set_pace(rate, burst, round(quiet * SECOND))
 
-    def set_lossless(self) -> None:
-        self._directory.is_lossless = True
+    def set_lossless(self, lossless: bool = True, *, addresses: bool = False) -> None:
+        self._directory.is_lossless = lossless
+        self._directory.has_addresses = lossless and addresses
+        self._schedule.set_lossless(lossless=lossless and addresses)
+        self._announcer.update_r2p()
 
     def hold(self, until: int) -> None:
         """Announce nothing before `until` (monotonic ns), as what was announced is not on the link yet."""
@@ -495,7 +499,7 @@ class Discovery(DiscoveryProtocol):
     def link_down(self, now: int) -> list[Event]:
         """End all leases. Firmware's subscriptions stay, as it does not notice a reconnect."""
         self._outbox.up = False
-        self._schedule.stop()
+        self._announcer.link_down()
         self._liveness.link_down(now)  # first: negotiation then drops what modules leave behind for a while
         self._negotiation.link_down()
         if self._demand is not None:
@@ -505,13 +509,15 @@ class Discovery(DiscoveryProtocol):
     def leave(self, now: int) -> list[Event]:
         self._outbox.send(self._announcer.hello(management.HELLO_LEAVING))
         self._outbox.up = False
-        self._schedule.stop()
+        self._announcer.link_down()
         return self._outbox.drain()
 
     def next_deadline(self) -> int | None:
         due = self._timers.next()
         if not self._outbox.up:
             return due
+        if self._announcer.has_answers:
+            return 0
         turn = self._schedule.due()
         return turn if due is None else min(due, turn)
 
