@@ -185,7 +185,7 @@ class LineLink(BufferedLink):
         if self._gate is not None:
             self.denied, self.key_refused = False, ""
         if self.lossless:
-            self.discovery.set_lossless()
+            self._apply(self.discovery.set_lossless(self._clock.monotonic()))
         self._begin_grace()
         self.on_up()
 

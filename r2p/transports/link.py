@@ -16,7 +16,6 @@ from typing import ClassVar, Protocol
 import msgspec
 
 from r2p.clock import Alarm
-from r2p.codecs import management
 from r2p.codecs.management import NO_PARAMS, QUEUE
 from r2p.keys import SharedKey
 from r2p.messages import ClockOffset, Message
@@ -25,6 +24,7 @@ from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.events import (
     AliasConflict,
     AliasFreed,
+    Answer,
     Command,
     Event,
     ModuleChanged,
@@ -258,23 +258,6 @@ class Link(abc.ABC):
         """Return what seals and what they seal have in common: the address they come from."""
         return source
 
-    def manage_all(self, messages: Iterable[bytes], source: Hashable) -> None:
-        """Handle management messages that came together; what they cause comes after the last one."""
-        now, receive, is_open = self._clock.monotonic(), self.discovery.receive, self.guard is None
-        acting, self._acting = self._acting, True
-        try:
-            for data in messages:
-                try:
-                    if is_open and management.type_of(data) in management.TOPIC_TYPES:  # as almost all
-                        self._events += receive(now, data, source)
-                    else:
-                        self.manage(data, source)
-                except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
-                    self.stats.lost.internal_error(error)
-        finally:
-            self._acting = acting
-        self._apply(())
-
     def handle_management(self, data: bytes, source: Hashable) -> None:
         """Handle a management message that counts, also on a link with a key."""
         if self.gateway_hooks is None or not self.gateway_hooks.handle_management(data):
@@ -293,8 +276,8 @@ class Link(abc.ABC):
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         """Send a management message before waiting samples, `urgent` ones before all; lost if nothing moves."""
 
-    def write_answer(self, data: bytes, to: Hashable) -> None:
-        """Send a management message to one address; only where discovery was told that addresses are possible."""
+    def write_answer(self, messages: tuple[bytes, ...], to: Hashable) -> None:
+        """Send management messages to one address; only where discovery was told that addresses are possible."""
         raise NotImplementedError
 
     @abc.abstractmethod
@@ -527,12 +510,12 @@ class Link(abc.ABC):
 
     def _act(self, event: Event) -> None:
         match event:
-            case Send(data, urgent, to):
+            case Send(data, urgent):
                 if self.up and (self.gateway_hooks is None or self.gateway_hooks.may_announce):
-                    if to is None:
-                        self.send_management(data, urgent=urgent)
-                    else:
-                        self.write_answer(data, to)
+                    self.send_management(data, urgent=urgent)
+            case Answer(messages, to):
+                if self.up and (self.gateway_hooks is None or self.gateway_hooks.may_announce):
+                    self.write_answer(messages, to)
             case SubscriberJoined():
                 self._subscriber_joined(event)
             case SubscribersGone(topic) if self.up or self._closed:

@@ -10,16 +10,17 @@ import random
 import weakref
 from collections import Counter, deque
 from collections.abc import Callable, Hashable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import msgspec
 
 from r2p.clock import check_seconds, in_background, random_of
-from r2p.codecs import own_services
+from r2p.codecs import management, own_services
 from r2p.errors import TransportError
 from r2p.keys import SharedKey
 from r2p.messages import SIZE_MAX, ClockOffset
 from r2p.names import MANAGEMENT
+from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import DirectedSample, PublisherClass, Sample, Source
 from r2p.transports.buffered_link import BufferedLink
@@ -274,6 +275,8 @@ class MemoryLink(BufferedLink):
 
     def __init__(self, name: str, hub: Hub, network: MemoryNetwork) -> None:
         super().__init__(name, hub)
+        assert isinstance(self.discovery, Discovery)
+        self._discovery = self.discovery
         self.network = network
         self._address = network.new_address()
         self._port = MemoryPort(
@@ -284,8 +287,7 @@ class MemoryLink(BufferedLink):
             takes_together=True,
         )
         self._together: list[bytes] = []
-        """Management messages of this turn, which go to the same address, or to all."""
-        self._to: Hashable = None
+        """Management messages of this turn."""
         self._times_left = TimesLeft()
 
     def connect(self) -> None:
@@ -333,48 +335,52 @@ class MemoryLink(BufferedLink):
         self.network.send(Datagram(self._address, own_services.topic_of(data), data))
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        self._write_together(data, None)
-
-    def write_answer(self, data: bytes, to: Hashable) -> None:
-        self._write_together(data, to)
-
-    def _write_together(self, data: bytes, to: Hashable) -> None:
-        """Send a management message together with others that are caused by the same events, or at once."""
-        if to != self._to:
-            self._send_together()
-        self._to = to
         self._together.append(data)
         if not self._acting:
             self._send_together()
 
-    def _send_together(self) -> None:
-        messages, self._together = self._together, []
-        if len(messages) > 1 and not self.network.faults:  # which are faults of single messages
-            self._send_management(Datagram(self._address, _MANAGEMENT, b"", together=tuple(messages)))
-        else:
-            for data in messages:
-                self._send_management(Datagram(self._address, _MANAGEMENT, data))
+    def write_answer(self, messages: tuple[bytes, ...], to: Hashable) -> None:
+        self._send_together()
+        for datagram in self._datagrams(messages):
+            self.network.send_to(cast("int", to), datagram)
 
-    def _send_management(self, datagram: Datagram) -> None:
-        if isinstance(self._to, int):
-            self.network.send_to(self._to, datagram)
-        else:
-            self.network.send(datagram)
+    def _send_together(self) -> None:
+        """Send the management messages that the same events have caused."""
+        if self._together:
+            messages, self._together = tuple(self._together), []
+            for datagram in self._datagrams(messages):
+                self.network.send(datagram)
+
+    def _datagrams(self, messages: tuple[bytes, ...]) -> list[Datagram]:
+        """Return messages as one, unless the network has faults, which are those of single messages."""
+        if len(messages) > 1 and not self.network.faults:
+            return [Datagram(self._address, _MANAGEMENT, b"", together=messages)]
+        return [Datagram(self._address, _MANAGEMENT, data) for data in messages]
 
     def _acted(self) -> None:
-        if self._together:
-            self._send_together()
+        self._send_together()
 
     def _review_faults(self) -> None:
         """Repeat little, and answer each module alone, while nothing is lost; with a key, all hear what it seals."""
-        self.discovery.set_lossless(not self.network.faults, addresses=self.guard is None)
-        self._apply(())
+        lossless, now = not self.network.faults, self._clock.monotonic()
+        self._apply(self.discovery.set_lossless(now, lossless=lossless, addresses=self.guard is None))
 
     def receive_other(self, arrival: Datagram) -> None:
         if arrival.together:
-            self.manage_all(arrival.together, arrival.port)
+            self._manage_together(arrival.together, arrival.port)
         else:
             super().receive_other(arrival)
+
+    def _manage_together(self, messages: tuple[bytes, ...], source: int) -> None:
+        """Handle management messages that came together; what they cause comes after the last one."""
+        first, topics = (messages, ()) if self.guard is not None else management.split_topics(messages)
+        acting, self._acting = self._acting, True
+        try:
+            for data in first:
+                self.stats.lost.guard(self.manage, data, source)
+        finally:
+            self._acting = acting
+        self._apply(self._discovery.receive_topics(self._clock.monotonic(), topics, source) if topics else ())
 
     def sample(self, topic: str, arrival: Datagram) -> Sample:
         self.stats.bytes_received += len(arrival.data)

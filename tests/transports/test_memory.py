@@ -1,11 +1,14 @@
-"""The faults of the in-memory network."""
+"""The in-memory network: its faults, and what its modules say without any."""
 
 import asyncio
-from contextlib import AsyncExitStack
+from collections import Counter
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import pytest
 
 import r2p
+from r2p.codecs import management
 from r2p.errors import TransportError
 from r2p.msg import Float32
 from r2p.sim import run
@@ -134,3 +137,72 @@ async def test_what_is_on_its_way_is_limited_in_bytes_too() -> None:
         assert net.full is full
     await asyncio.sleep(1.5)
     assert (received, net.full) == ([image] * 2, False)
+
+
+class Listener:
+    """A port that hears what is said to all, message by message; it counts the topics of `publisher_of`."""
+
+    def __init__(self, net: MemoryNetwork) -> None:
+        self.advertised: Counter[str] = Counter()
+        net.plug_in(net.new_address(), MemoryPort(net, self._hear, lambda: None))
+
+    def _hear(self, datagram: Datagram) -> None:
+        message = management.decode(datagram.data)
+        if isinstance(message, management.Advertise) and "/" in message.topic:
+            self.advertised[message.topic] += 1
+
+
+@asynccontextmanager
+async def publisher_of(net: MemoryNetwork, name: str, topics: int = 3) -> AsyncIterator[None]:
+    async with r2p.Module(name, via=net.transport()) as module, node_in(module) as node:
+        for number in range(topics):
+            node.advertise(f"{name}/t{number}", Float32)
+        yield
+
+
+@pytest.mark.virtual_time
+async def test_one_who_is_new_is_told_everything_alone() -> None:
+    net = MemoryNetwork()
+    async with publisher_of(net, "A"), publisher_of(net, "B"):
+        await asyncio.sleep(5)
+        listener = Listener(net)
+        async with r2p.Module("C", via=net.transport()) as newcomer:
+            await asyncio.sleep(0.1)
+            assert {"A/t0", "A/t2", "B/t0", "B/t2"} <= newcomer.links[0].discovery.topics.keys()
+            assert len([each for each in newcomer.links[0].discovery.endpoints.values() if "/t" in each.topic]) == 6
+    assert not listener.advertised
+
+
+@pytest.mark.virtual_time
+async def test_what_is_said_is_repeated_again_when_something_may_be_lost() -> None:
+    net = MemoryNetwork()
+    async with publisher_of(net, "A"), publisher_of(net, "B"):
+        await asyncio.sleep(1)
+        listener = Listener(net)
+        await asyncio.sleep(10)
+        assert not listener.advertised
+        net.loss = 1e-9
+        await asyncio.sleep(10)
+        assert min(listener.advertised[f"{module}/t{n}"] for module in "AB" for n in range(3)) >= 4
+        net.loss = 0.0
+        await asyncio.sleep(5)
+        listener.advertised.clear()
+        await asyncio.sleep(10)
+        assert not listener.advertised
+
+
+@pytest.mark.virtual_time
+async def test_what_a_start_and_a_second_of_rest_cost_each_pair_of_modules() -> None:
+    start, rest = dict[int, float](), dict[int, float]()
+    for count in (5, 20):
+        net = MemoryNetwork()
+        async with AsyncExitStack() as stack:
+            for number in range(count):
+                await stack.enter_async_context(publisher_of(net, f"M{number}"))
+            await asyncio.sleep(20)
+            delivered, pairs = net.counts["delivered"], count * (count - 1)
+            start[count] = delivered / pairs
+            await asyncio.sleep(100)
+            rest[count] = (net.counts["delivered"] - delivered) / pairs / 100
+    assert start[20] < 1.5 * start[5]
+    assert rest[20] < 1.1 * rest[5] < 1.1

@@ -112,6 +112,11 @@ class LinkNames:
 
     # Translation
 
+    @property
+    def has_aliases(self) -> bool:
+        """Whether names in received messages may be aliases of longer ones."""
+        return bool(self._long or self._learnt)
+
     def to_wire(self, message: M) -> M:
         """Return a message with the alias of each name that is too long for its field."""
         cls = type(message)
@@ -132,7 +137,7 @@ class LinkNames:
 
     def from_wire(self, message: M) -> M:
         """Return a message with the names of topics and nodes behind known aliases."""
-        if not (self._long or self._learnt):  # on most links: then each message costs no more than this
+        if not self.has_aliases:  # on most links: then each message costs no more than this
             return message
         changes: dict[str, Any] = {}
         for field, kind in _FIELDS.get(type(message), ()):

@@ -33,7 +33,7 @@ _KindName = tuple[int, str]
 
 _HELLO_EACH = 3
 """Presences in a crowd of which one has a HELLO: ALIVE extends the lease as well."""
-_ANSWERS_AT_ONCE = 64
+_ANSWERS_AT_ONCE = 256
 """Items said to one module in one turn."""
 _KIND_OF_ROLE = {ROLE_PUBLISHES: ItemKind.PUBLISHER, ROLE_SUBSCRIBES: ItemKind.SUBSCRIBER}
 
@@ -47,6 +47,14 @@ class LocalTopic(msgspec.Struct, frozen=True):
 
     def type_info(self, topic: str, role: int) -> management.TypeInfo:
         return management.TypeInfo(role, topic, self.type.fingerprint, self.type.size_field)
+
+
+class _Part(msgspec.Struct, frozen=True):
+    """A part of an answer about everything, as of a revision of the schedule."""
+
+    revision: int
+    items: list[Item]
+    messages: tuple[bytes, ...]
 
 
 class Announcer:
@@ -91,8 +99,10 @@ class Announcer:
         """Topics whose names are announced, also while the link does not carry them as another one has the alias."""
         self._long_names: Counter[_KindName] = Counter()
         """Names that travel as aliases, and how many announcements have each."""
-        self._answers: dict[PeerAddress, deque[Item]] = {}
+        self._answers: dict[PeerAddress, deque[_Part]] = {}
         """What is still to be said to modules that have asked, by address."""
+        self._answer: list[_Part] = []
+        """The last answer, for others that ask until something changes."""
         schedule.is_settled = self._is_settled
         self._hello_in = 0
         """Presences until the next HELLO in a crowd."""
@@ -154,11 +164,19 @@ class Announcer:
         """Repeat the request for a topic until it has been answered."""
         self._schedule.quicken(Item(ItemKind.SUBSCRIBER, (topic,)))
 
+    def await_agreement(self, topic: str, role: int) -> None:
+        """Repeat a topic until its type fits those of its peers."""
+        self._schedule.quicken(Item(_KIND_OF_ROLE[role], (topic,)))
+
     def _is_settled(self, item: Item) -> bool:
         """Return whether a topic needs no answer: a subscriber without a known publisher has none to come."""
-        if item.kind is not ItemKind.SUBSCRIBER or item.key[0] in self.publisher_counts:
+        if item.kind not in _KIND_OF_ROLE.values():
             return True
         info = self._directory.topics.get(str(item.key[0]))
+        if info is not None and info.mismatch:  # the peer may take it, once it has forgotten the type of before
+            return False
+        if item.kind is ItemKind.PUBLISHER or item.key[0] in self.publisher_counts:
+            return True
         return info is None or info.advertised_at is None
 
     def repeat_all(self, now: int, *, tool: bool) -> None:
@@ -170,7 +188,11 @@ class Announcer:
         """Say everything to one module that asks, where that is possible and arrives. What is to be announced for the
         first time is not said twice.
         """
-        self._answers[source] = deque([Item(ItemKind.QUERY), *self._schedule.announced()])
+        if not self._answer or self._answer[0].revision != self._schedule.revision:
+            items = self._schedule.announced()
+            starts = range(0, max(len(items), 1), _ANSWERS_AT_ONCE)
+            self._answer = [self._part(items[at : at + _ANSWERS_AT_ONCE]) for at in starts]
+        self._answers[source] = deque(self._answer)
 
     @property
     def has_answers(self) -> bool:
@@ -271,15 +293,17 @@ class Announcer:
 
     def _answer_one(self) -> None:
         """Say to one of those that have asked what fits into a turn."""
-        source, items = next(iter(self._answers.items()))
-        for _ in range(min(len(items), _ANSWERS_AT_ONCE)):
-            item = items.popleft()
-            if item.kind is ItemKind.QUERY:
-                self.outbox.send(*self._introduction(), to=source)
-            elif item in self._schedule:  # else it has ended meanwhile
-                self.outbox.send(*self._messages(item), to=source)
-        if not items:
+        source, parts = next(iter(self._answers.items()))
+        part = parts.popleft()
+        if part.revision != self._schedule.revision:
+            part = self._part([item for item in part.items if item in self._schedule])
+        self.outbox.answer(source, self.outbox.encode(self._introduction()) + part.messages)
+        if not parts:
             del self._answers[source]
+
+    def _part(self, items: list[Item]) -> "_Part":
+        messages = self.outbox.encode(each for item in items for each in self._messages(item))
+        return _Part(self._schedule.revision, items, messages)
 
     # The messages
 

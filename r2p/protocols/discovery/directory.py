@@ -18,7 +18,7 @@ from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, TopicType
 from r2p.protocols.discovery.schedule import CROWD, CROWD_ROUNDS, SLOW_ROUNDS
 from r2p.protocols.timers import KeyedTimers
-from r2p.units import MILLISECOND, SECOND
+from r2p.units import MILLISECOND, NEVER, SECOND
 
 TABLE_MAX = 16_384
 """Entries in each table."""
@@ -153,8 +153,8 @@ class Directory:
 
     def lease_of(self, source: PeerAddress) -> int | None:
         """Return the longest lease of topics of modules at an address; None without any, or if it never ends."""
-        lease = max(self._leases.get(source, ()), default=FOR_EVER)
-        return lease if lease < FOR_EVER else None
+        lease = max(self._leases.get(source, ()), default=NEVER)
+        return lease if lease < NEVER else None
 
     def is_alone(self, source: PeerAddress, instance: int) -> bool:
         """Return whether no other module than this one is known directly at an address."""
@@ -287,14 +287,25 @@ class Directory:
         self._endpoints_of.setdefault(info.instance, {})[key] = None
         if old is not None:
             self._drop_endpoint((old.instance, old.node, old.topic, old.role))
-        known = self.modules.get(info.module)
-        if known is None:  # the HELLO of its module may never come
+        self._start_lease(now, key, self.modules.get(info.module))
+
+    def _start_lease(self, now: int, key: EndpointKey, module: ModuleInfo | None) -> None:
+        """Let an endpoint of a known module end if it is not repeated; its end is not lost where nothing is."""
+        if module is None:  # its HELLO may never come
             self.timers.set(("endpoint", key), now + LEASE)
-        elif known.lease < FOR_EVER:
-            rounds = CROWD_ROUNDS if known.knows_crowds else SLOW_ROUNDS
-            self.timers.set(("endpoint", key), now + rounds * known.lease)
-        else:
+        elif module.lease < FOR_EVER and not (self.is_lossless and module.hops == 0):
+            rounds = CROWD_ROUNDS if module.knows_crowds else SLOW_ROUNDS
+            self.timers.set(("endpoint", key), now + rounds * module.lease)
+        elif ("endpoint", key) in self.timers:
             self.timers.clear(("endpoint", key))
+
+    def set_lossless(self, now: int, *, lossless: bool, has_addresses: bool) -> None:
+        """Note whether all that is sent arrives, and whether it can be sent to one module alone."""
+        was_lossless, self.is_lossless = self.is_lossless, lossless
+        self.has_addresses = has_addresses
+        if was_lossless and not lossless:
+            for key, info in self.endpoints.items():
+                self._start_lease(now, key, self.modules.get(info.module))
 
     def rename(self, now: int, kind: int, old: str, new: str) -> None:
         """Rename a topic or a node (KIND_...) from its alias to the name behind it, or back."""
@@ -362,8 +373,10 @@ class Directory:
 
 
 def topic_lease(info: ModuleInfo) -> int:
-    """Return how long a topic is kept that its r2p module does not repeat (ns); it ends with the module, anyway."""
-    return min(info.lease * CROWD_ROUNDS, FOR_EVER - 1) if info.knows_crowds and info.lease < FOR_EVER else info.lease
+    """Return how long a topic is kept that its r2p module does not repeat (ns), or NEVER; it ends with the module."""
+    if info.lease >= FOR_EVER:
+        return NEVER
+    return info.lease * CROWD_ROUNDS if info.knows_crowds else info.lease
 
 
 def counterpart(role: int) -> int:

@@ -130,11 +130,17 @@ def possible_senders(modules: Iterable[ModuleInfo]) -> set[str]:
 
 
 class Send(msgspec.Struct, frozen=True):
-    """Send these 32 bytes on the topic `R2P`, `urgent` ones before everything else; `to` one address, or to all."""
+    """Send these 32 bytes on the topic `R2P`, `urgent` ones before everything else."""
 
     data: bytes
     urgent: bool = False
-    to: PeerAddress = None
+
+
+class Answer(msgspec.Struct, frozen=True):
+    """Send these messages to the one module that needs them; only where discovery was told that the link can."""
+
+    messages: tuple[bytes, ...]
+    to: PeerAddress
 
 
 class SubscriberJoined(msgspec.Struct, frozen=True):
@@ -321,6 +327,7 @@ class QueryTokens(msgspec.Struct, frozen=True):
 
 Event = (
     Send
+    | Answer
     | SubscriberJoined
     | SubscribersGone
     | SubscriberLeft
@@ -356,12 +363,20 @@ class Outbox:
         self._events: list[Event] = []
         self._sent: deque[bytes] = deque(maxlen=_SENT_MAX)
 
-    def send(self, *messages: management.Management, urgent: bool = False, to: PeerAddress = None) -> None:
+    def send(self, *messages: management.Management, urgent: bool = False) -> None:
         if self.up:
             for message in messages:
                 data = management.encode(self._to_wire(message))
                 self._sent.append(data)
-                self._events.append(Send(data, urgent, to))
+                self._events.append(Send(data, urgent))
+
+    def encode(self, messages: Iterable[management.Management]) -> tuple[bytes, ...]:
+        """Return messages as they are for `answer`."""
+        return tuple(management.encode(self._to_wire(message)) for message in messages)
+
+    def answer(self, to: PeerAddress, messages: tuple[bytes, ...]) -> None:
+        if self.up and messages:
+            self._events.append(Answer(messages, to))
 
     def emit(self, *events: Event) -> None:
         self._events += events

@@ -17,7 +17,7 @@ import msgspec
 from r2p.codecs import management
 from r2p.codecs.management import ANSWERED, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic
-from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory, counterpart, decrement, topic_lease
+from r2p.protocols.discovery.directory import LEASE, Directory, counterpart, decrement, topic_lease
 from r2p.protocols.discovery.events import (
     Mismatched,
     ModuleInfo,
@@ -28,7 +28,7 @@ from r2p.protocols.discovery.events import (
     SubscribersGone,
     TopicType,
 )
-from r2p.units import MILLISECOND, SECOND
+from r2p.units import MILLISECOND, NEVER, SECOND
 
 M = TypeVar("M", management.Advertise, management.SubscribeRequest)
 
@@ -77,7 +77,8 @@ class Peer(msgspec.Struct, eq=False):
 
     def add_module(self, now: int, info: ModuleInfo) -> None:
         """Enter an r2p module that said HELLO from this address."""
-        lease = None if info.lease >= FOR_EVER else topic_lease(info)
+        after = topic_lease(info)
+        lease = after if after < NEVER else None
         shared = len(self.direct) > (info.name in self.direct)
         if shared and lease is not None:  # the longest lease counts, and that only ends with them all
             lease = max(lease, self.lease) if self.lease is not None else None
@@ -193,9 +194,12 @@ class SubscriptionNegotiation:
             if own is not None and requests:
                 self._send_response(now, topic, own, requests)
 
-    def _address(self, asked: list[tuple[Peer, M]]) -> PeerAddress:
-        """Return to whom an answer goes: to the one that asked, where that is possible and arrives; None: to all."""
-        return asked[0][0].source if self._directory.has_addresses and len(asked) == 1 else None
+    def _answer_alone(self, asked: list[tuple[Peer, M]], answer: list[management.Management]) -> bool:
+        """Answer the one that has asked, where that is possible and arrives; else return False."""
+        if not self._directory.has_addresses or len(asked) != 1:
+            return False
+        self._outbox.answer(asked[0][0].source, self._outbox.encode(answer))
+        return True
 
     def _with_peers(self, asked: list[tuple[PeerAddress, M]]) -> list[tuple[Peer, M]]:
         return [(peer, message) for source, message in asked if (peer := self._peers.get(source)) is not None]
@@ -206,29 +210,32 @@ class SubscriptionNegotiation:
         """Request the messages of publishers, but for those of r2p that have responded meanwhile."""
         r2p = [peer.is_r2p(now) for peer, _ in offers]
         offers = [each for each, is_r2p in zip(offers, r2p, strict=True) if not (is_r2p and _receives(*each))]
-        to = self._address(offers)
+        answer: list[management.Management] = []
         if any(r2p) and offers:  # before the request: publishers compare it with theirs when they respond
-            self._outbox.send(own.type_info(topic, ROLE_SUBSCRIBES), to=to)
+            answer.append(own.type_info(topic, ROLE_SUBSCRIBES))
         sizes = [
             offer.size for peer, offer in offers if self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, offer))
         ]
         if sizes:
-            self._outbox.send(*self._own.requests(topic, own, sizes[-1]), to=to)
-            if to is None:
+            answer += self._own.requests(topic, own, sizes[-1])
+        if not self._answer_alone(offers, answer):
+            self._outbox.send(*answer)
+            if sizes:
                 self._own.await_response(topic)
 
     def _send_response(
         self, now: int, topic: str, own: LocalTopic, requests: list[tuple[Peer, management.SubscribeRequest]]
     ) -> None:
         """Respond to subscribers, and attach those that are new."""
-        to = self._address(requests)
+        asked, answer = requests, list[management.Management]()
         if any(_needs_type(now, peer, request) for peer, request in requests):
-            self._outbox.send(own.type_info(topic, ROLE_PUBLISHES), to=to)
+            answer.append(own.type_info(topic, ROLE_PUBLISHES))
         requests = [each for each in requests if self._may_subscribe(*each, own.type)]
-        if not requests:
-            return
-        queue = max(requests[-1][1].queue, 1)  # a request with 0, at which firmware halts, is answered with 1
-        self._outbox.send(management.SubscribeResponse(topic, own.type.size_field, queue, own.params), to=to)
+        if requests:
+            queue = max(requests[-1][1].queue, 1)  # a request with 0, at which firmware halts, is answered with 1
+            answer.append(management.SubscribeResponse(topic, own.type.size_field, queue, own.params))
+        if not self._answer_alone(asked, answer):
+            self._outbox.send(*answer)
         for peer, request in requests:
             unanswered = peer.is_r2p(now) and request.params == UNANSWERED
             if self._add_subscriber(now, peer, topic, unanswered=unanswered):
@@ -382,6 +389,7 @@ class SubscriptionNegotiation:
         if fits:
             peer.mismatched.pop((topic, role), None)
             return True
+        self._own.await_agreement(topic, counterpart(role))
         if peer.mismatched.get((topic, role)) != theirs:
             peer.mismatched[topic, role] = theirs
             self._outbox.emit(Mismatched(topic, peer.source, role, ours, theirs))

@@ -28,7 +28,12 @@ CROWD = 5
 """Other modules on the link from which on topics are repeated in the slow ring, if all of them know that."""
 CROWD_ROUNDS = 14
 """The most turns of the ring in which the slow ring turns once, reached with as many modules."""
+_LOSSLESS_ROUNDS = 2 * CROWD_ROUNDS
+"""The same where nothing is lost, and those that are new are told everything."""
+_TOGETHER = 16
+"""Items that are repeated in one step there."""
 _PRESENCE_MODULES = 30
+_LOSSLESS_MODULES = 20
 _PRESENCE_MAX = 10
 """For each so many modules, a round takes as long as another one, up to so many."""
 _PRESENCE_INTERVAL = SECOND // 10
@@ -129,7 +134,10 @@ class Schedule:
         self._rounds = SLOW_ROUNDS
         self.is_settled: Callable[[Item], bool] = lambda item: True
         """Whether a topic waits for no answer; called for those of a crowd."""
-        self._turns = _TURNS
+        self.revision = 0
+        """A number that changes with what has been announced."""
+        self._lossless = False
+        self._burst = 0  # further steps of the present ones together
 
     def hold(self, until: int) -> None:
         """Let nothing go before this instant (ns), but for presences that are overdue."""
@@ -141,22 +149,26 @@ class Schedule:
         self._quiet = quiet
 
     def set_lossless(self, *, lossless: bool) -> None:
-        """Announce everything once before it is repeated slowly, instead of twice, while nothing is lost."""
-        if self._turns != 1 and lossless:
-            self._turns = 1
-        elif self._turns == 1 and not lossless:
-            self._turns = _TURNS
+        """Note whether nothing is lost, and those that are new are told everything: then less is repeated."""
+        if self._lossless and not lossless:
             self._hurry()
+        self._lossless = lossless
+
+    @property
+    def _turns(self) -> int:
+        """How often everything is announced before it is repeated slowly."""
+        return 1 if self._lossless else _TURNS
 
     def set_crowd(self, modules: int) -> None:
         """Repeat topics slowly, as so many modules of r2p are on the link; 0: as usual."""
         if modules and not self._crowd:
             # From the next step on; where nothing is lost, all was announced to those that are there.
-            self._lap = max(self._eager if self._turns == 1 else self._lap, 1)
+            self._lap = max(self._eager if self._lossless else self._lap, 1)
         elif self._crowd and not modules:
             self._include_slow()
         self._crowd = modules
-        self._rounds = min(max(SLOW_ROUNDS, modules), CROWD_ROUNDS) if modules else SLOW_ROUNDS
+        rounds = min(max(SLOW_ROUNDS, modules), CROWD_ROUNDS) if modules else SLOW_ROUNDS
+        self._rounds = _LOSSLESS_ROUNDS if self._lossless and modules else rounds
 
     def quicken(self, item: Item) -> None:
         """Repeat an item in the fast ring, if it is in the slow one, until it is settled."""
@@ -172,6 +184,7 @@ class Schedule:
         self.drop(item)  # it is announced now, so its place in a ring would announce it twice
         self._fresh[item] = None
         self._count += not item.once
+        self.revision += 1
 
     def relay(self, item: Item) -> None:
         """Announce another module's item once, in turn with this module's own. A waiting one keeps its turn."""
@@ -183,6 +196,7 @@ class Schedule:
             if item in items:
                 del items[item]
                 self._count -= not item.once
+                self.revision += 1
 
     def start(self, now: int) -> None:
         """Begin, now that the link is up: first with a query, then with everything."""
@@ -198,7 +212,7 @@ class Schedule:
         self._ring.update((item, None) for item in self._fresh if not item.once)
         self._fresh.clear()
         self._relayed.clear()
-        self._eager = 0
+        self._eager = self._burst = 0
         self._repeated_at, self._repeat_at, self._tool_waits = -_ROUND, None, False
 
     def repeat(self, now: int, modules: int = 1, *, tool: bool = False) -> None:
@@ -289,7 +303,12 @@ class Schedule:
         if not self._crowd:
             return min(_STEP, _ROUND // (self._places + 1))
         share = self._rounds * (self._count - len(self._slow)) + len(self._slow)
-        return self._crowd_round * self._rounds // max(1, share)
+        return self._together * self._crowd_round * self._rounds // max(1, share)
+
+    @property
+    def _together(self) -> int:
+        """Items in one step: several where nobody waits for any of them."""
+        return max(1, min(_TOGETHER, len(self._slow))) if self._lossless and not self._ring else 1
 
     @property
     def _presence_period(self) -> int:
@@ -301,7 +320,8 @@ class Schedule:
     @property
     def _crowd_round(self) -> int:
         """Ns in which a module of a crowd repeats its presence, and what it says in every round."""
-        return _ROUND * min(max(1, self._crowd // _PRESENCE_MODULES), _PRESENCE_MAX)
+        each = _LOSSLESS_MODULES if self._lossless else _PRESENCE_MODULES
+        return _ROUND * min(max(1, self._crowd // each), _PRESENCE_MAX)
 
     def _repeat(self, now: int) -> None:
         self._repeated_at, self._repeat_at, self._tool_waits = now, None, False
@@ -310,6 +330,7 @@ class Schedule:
     def _hurry(self) -> None:
         """Announce everything without waiting, and once more in the next turn if an answer may be lost."""
         self._include_slow()
+        self.revision += 1
         self._eager, self._lap = self._count, self._turns * self._count
 
     def _include_slow(self) -> None:
@@ -328,13 +349,17 @@ class Schedule:
     def _repetition(self) -> Item:
         """The next item of the ring, or of the slow ring so often that it turns once in `_rounds`."""
         ring, slow = self._ring, self._slow
+        if not self._eager:
+            self._burst = (self._burst or self._together) - 1
         share = self._rounds * len(ring) + len(slow)
         self._owed += len(slow)  # of `share` steps, len(slow) go to the slow ring
         if slow and self._owed >= share:
             self._owed %= share
             return _next(slow)
         item = _next(ring)
-        self._eager -= self._eager > 0
+        if self._eager:
+            self._eager -= 1
+            self.revision += 1
         self._lap -= 1
         if self._lap == 0:
             self._slow_down()
@@ -342,7 +367,8 @@ class Schedule:
 
     def _announced(self, item: Item) -> None:
         """Enter a new item into a ring, as it is announced for the first time."""
-        if self._turns == 1 and self._is_slow(item):
+        self.revision += 1
+        if self._lossless and self._is_slow(item):
             self._slow[item] = None
         else:
             self._ring[item] = None
@@ -363,7 +389,7 @@ class Schedule:
         if self._eager > self._count:
             self._eager = self._count
         turn = self._presence_at
-        if self._eager:
+        if self._eager or self._burst:
             turn = 0
         elif self._step_at < turn:
             turn = self._step_at

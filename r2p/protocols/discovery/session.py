@@ -108,12 +108,13 @@ class DiscoveryProtocol(ABC):
         """Return the address of an r2p module on the link itself; None if it is not known, or behind a gateway."""
         return None
 
-    def set_lossless(self, lossless: bool = True, *, addresses: bool = False) -> None:
+    def set_lossless(self, now: int, *, lossless: bool = True, addresses: bool = False) -> list[Event]:
         """Note whether all that is sent arrives, for as long as the link is up: then little needs to be repeated.
 
         `addresses`: the link can also send to one module alone, so that one who asks is answered alone. Nothing is to
         be done where nothing is repeated, anyway.
         """
+        return []
 
     def refresh_ages(self, now: int) -> None:
         """Bring the times at which things were heard up to date, before they are read.
@@ -480,11 +481,12 @@ class Discovery(DiscoveryProtocol):
         """
         self._schedule.set_pace(rate, burst, round(quiet * SECOND))
 
-    def set_lossless(self, lossless: bool = True, *, addresses: bool = False) -> None:
-        self._directory.is_lossless = lossless
-        self._directory.has_addresses = lossless and addresses
-        self._schedule.set_lossless(lossless=lossless and addresses)
+    def set_lossless(self, now: int, *, lossless: bool = True, addresses: bool = False) -> list[Event]:
+        has_addresses = lossless and addresses
+        self._directory.set_lossless(now, lossless=lossless, has_addresses=has_addresses)
+        self._schedule.set_lossless(lossless=has_addresses)
         self._announcer.update_r2p()
+        return self._flush(now)
 
     def hold(self, until: int) -> None:
         """Announce nothing before `until` (monotonic ns), as what was announced is not on the link yet."""
@@ -533,6 +535,19 @@ class Discovery(DiscoveryProtocol):
         for key in self._timers.pop(now):
             self._expired(now, key)
         return self._flush(now)
+
+    def receive_topics(self, now: int, messages: tuple[management.Management, ...], source: PeerAddress) -> list[Event]:
+        """Handle messages about topics that came together, decoded, from a network that returns no echoes."""
+        if not self._outbox.up:
+            self.counts["link down"] += len(messages)
+            return []
+        self._schedule.traffic(now)
+        handlers, demand = self._handlers, self._demand
+        for message in map(self._names.from_wire, messages) if self._names.has_aliases else messages:
+            handlers[type(message)](now, message, source)
+            if demand is not None:
+                demand.receive(now, message, source)
+        return self._outbox.drain()
 
     def receive(self, now: int, data: bytes, source: PeerAddress = None) -> list[Event]:
         if not self._outbox.up:

@@ -3,19 +3,22 @@
 import math
 import random
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery.directory import LEASE
+from r2p.protocols.discovery.directory import LEASE, topic_lease
 from r2p.protocols.discovery.events import (
     Event,
+    ModuleInfo,
     PublisherFound,
     PublisherGone,
     Send,
     SubscriberJoined,
     SubscribersGone,
 )
+from r2p.protocols.discovery.schedule import Item, ItemKind, Schedule
 from r2p.protocols.discovery.session import Discovery
 from tests.protocols.discovery.wire import MS, S, hear, run, sent
 
@@ -102,6 +105,28 @@ def test_a_start_costs_each_module_a_few_repetitions() -> None:
     assert math.log(said[24] / said[6]) / math.log(24 / 6) < 1.2
 
 
+@pytest.mark.parametrize("modules", [0, 5, 50, 130, 1000])
+@pytest.mark.parametrize("lossless", [False, True])
+def test_topics_are_repeated_before_others_forget_them(modules: int, lossless: bool) -> None:
+    schedule = Schedule(rate=1e6, burst=32, quiet=0)
+    schedule.set_lossless(lossless=lossless)
+    for topic in range(3):
+        schedule.add(Item(ItemKind.PUBLISHER, (f"t{topic}",)))
+    schedule.start(0)
+    schedule.set_crowd(modules)
+    wire = m.WIRE_CROWD if modules else 0
+    lease = topic_lease(ModuleInfo("M", instance=1, lease=max(LEASE, 3 * schedule.round_time), wire=wire))
+    said: dict[Item, list[int]] = {}
+    while (now := max(schedule.due(), 0)) < 3 * lease:
+        item = schedule.pop(now)
+        if item is not None:
+            said.setdefault(item, []).append(now)
+            schedule.sent(now, 1)
+    topics = [times for item, times in said.items() if item.kind is ItemKind.PUBLISHER]
+    assert len(topics) == 3
+    assert max(later - at for times in topics for at, later in pairwise(times)) < lease
+
+
 @pytest.mark.parametrize("loss", [0.1, 0.4])
 def test_losses_are_made_good(loss: float) -> None:
     crowd = Crowd(8, loss=loss)
@@ -122,7 +147,7 @@ def test_a_subscription_outlasts_its_lease_while_its_module_is_there_and_no_long
 
 def test_where_nothing_is_lost_one_other_module_is_enough() -> None:
     discovery = Discovery("PC1", 99)
-    discovery.set_lossless()
+    discovery.set_lossless(0)
     discovery.advertise(0, "leds", 5)
     discovery.link_up(0)
     hear(discovery, 0, m.Hello("M1", 1, lease_ms=60_000, wire=m.WIRE_VERSION), m.Alive("M1", 0))
