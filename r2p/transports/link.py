@@ -24,7 +24,6 @@ from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.events import (
     AliasConflict,
     AliasFreed,
-    Answer,
     Command,
     Event,
     ModuleChanged,
@@ -32,6 +31,7 @@ from r2p.protocols.discovery.events import (
     PublisherFound,
     PublisherGone,
     Send,
+    SendTo,
     SubscriberJoined,
     SubscribersGone,
     possible_senders,
@@ -513,7 +513,7 @@ class Link(abc.ABC):
             case Send(data, urgent):
                 if self.up and (self.gateway_hooks is None or self.gateway_hooks.may_announce):
                     self.send_management(data, urgent=urgent)
-            case Answer(messages, to):
+            case SendTo(messages, to):
                 if self.up and (self.gateway_hooks is None or self.gateway_hooks.may_announce):
                     self.write_answer(messages, to)
             case SubscriberJoined():

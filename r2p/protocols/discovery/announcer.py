@@ -49,7 +49,7 @@ class LocalTopic(msgspec.Struct, frozen=True):
         return management.TypeInfo(role, topic, self.type.fingerprint, self.type.size_field)
 
 
-class _Part(msgspec.Struct, frozen=True):
+class _AnswerPart(msgspec.Struct, frozen=True):
     """A part of an answer about everything, as of a revision of the schedule."""
 
     revision: int
@@ -99,9 +99,9 @@ class Announcer:
         """Topics whose names are announced, also while the link does not carry them as another one has the alias."""
         self._long_names: Counter[_KindName] = Counter()
         """Names that travel as aliases, and how many announcements have each."""
-        self._answers: dict[PeerAddress, deque[_Part]] = {}
+        self._answers: dict[PeerAddress, deque[_AnswerPart]] = {}
         """What is still to be said to modules that have asked, by address."""
-        self._answer: list[_Part] = []
+        self._answer: list[_AnswerPart] = []
         """The last answer, for others that ask until something changes."""
         schedule.is_settled = self._is_settled
         self._hello_in = 0
@@ -301,9 +301,9 @@ class Announcer:
         if not parts:
             del self._answers[source]
 
-    def _part(self, items: list[Item]) -> "_Part":
+    def _part(self, items: list[Item]) -> "_AnswerPart":
         messages = self.outbox.encode(each for item in items for each in self._messages(item))
-        return _Part(self._schedule.revision, items, messages)
+        return _AnswerPart(self._schedule.revision, items, messages)
 
     # The messages
 

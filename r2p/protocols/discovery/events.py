@@ -136,7 +136,7 @@ class Send(msgspec.Struct, frozen=True):
     urgent: bool = False
 
 
-class Answer(msgspec.Struct, frozen=True):
+class SendTo(msgspec.Struct, frozen=True):
     """Send these messages to the one module that needs them; only where discovery was told that the link can."""
 
     messages: tuple[bytes, ...]
@@ -327,7 +327,7 @@ class QueryTokens(msgspec.Struct, frozen=True):
 
 Event = (
     Send
-    | Answer
+    | SendTo
     | SubscriberJoined
     | SubscribersGone
     | SubscriberLeft
@@ -376,7 +376,7 @@ class Outbox:
 
     def answer(self, to: PeerAddress, messages: tuple[bytes, ...]) -> None:
         if self.up and messages:
-            self._events.append(Answer(messages, to))
+            self._events.append(SendTo(messages, to))
 
     def emit(self, *events: Event) -> None:
         self._events += events
