@@ -360,7 +360,7 @@ class _Readiness:
     def set(self) -> None:
         """Make it readable."""
         if self._set:
-            return  # a reader that is about to clear it looks at its queue after that
+            return  # a reader that is about to clear it looks at its queue once more after that
         with self._lock:
             if not self._closed and not self._set:
                 self._set = True
@@ -373,6 +373,8 @@ class _Readiness:
                 if not self._closed and self._set and empty():  # type: ignore[redundant-expr] # by another thread
                     self._reader.recv(1)
                     self._set = False
+            if not empty():  # what came meanwhile found it set
+                self.set()
 
     def close(self) -> None:
         """Make it unreadable for good."""

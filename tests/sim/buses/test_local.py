@@ -1,6 +1,7 @@
 """Attachments to buses of this process: their ends, and what several threads do at once."""
 
 import asyncio
+import select
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -142,3 +143,23 @@ async def flush_while_another_thread_sends(channel: str, *, starts: bool) -> lis
 @pytest.mark.parametrize("starts", [False, True])
 def test_flush_drops_what_waits_and_nothing_else(starts: bool) -> None:
     assert r2p.sim.run(flush_while_another_thread_sends("flush", starts=starts)) == [0] * starts + [9, 10]
+
+
+def test_a_frame_that_comes_while_its_descriptor_is_cleared_is_seen() -> None:
+    """The writer finds the descriptor set, just before the reader, who saw an empty queue, clears it."""
+    ready, looks, frames = local._Readiness(), [0], list[int]()
+    ready.set()
+
+    def is_empty() -> bool:
+        looks[0] += 1
+        empty = not frames
+        if looks[0] == 2:  # the last look before it is cleared
+            frames.append(1)
+            ready.set()
+        return empty
+
+    ready.clear_if(is_empty)
+    assert select.select([ready.fileno()], [], [], 0)[0]
+    frames.clear()
+    ready.clear_if(is_empty)
+    assert not select.select([ready.fileno()], [], [], 0)[0]
