@@ -273,14 +273,14 @@ def _fusing() -> dict[str, Screen]:
 
 
 async def _robocom() -> dict[str, Screen]:
-    """Robocom, on its second circle."""
+    """Robocom, on its figure of eight."""
     screens: dict[str, Screen] = {}
 
     def show(screen: SimulatorScreen, figures: RobotFigures) -> None:
         screens["robocom"] = _frame(screen, figures, COLUMNS, 24, "r2p sim robocom --drive")
 
     with patch.object(SimulatorScreen, "show", show):
-        await simulate(RobocomDisplay, duration=20.0, outside=[_OUTSIDE], rounds=1)
+        await simulate(RobocomDisplay, duration=12.0, outside=[_OUTSIDE], rounds=1)
     return screens
 
 
