@@ -564,7 +564,8 @@ class Node:
     async def _serve(self) -> bool:
         served = False
         for subscriber in self._with_callback():
-            served |= await subscriber.serve()
+            if subscriber.queue:  # of many subscriptions, one has a message as a rule
+                served |= await subscriber.serve()
         return served
 
     def _has_callback(self) -> None:

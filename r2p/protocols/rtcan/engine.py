@@ -30,7 +30,7 @@ then go as a soft real-time message with the period as deadline. After `SlotsLos
 from collections.abc import Hashable, Sequence
 
 from r2p.codecs import management, rtcan
-from r2p.codecs.rtcan import HIGH_MAX, HIGH_SHIFT, ID8_MAX, MANAGEMENT, MESSAGE_SHIFT, NOT_SYNC, Frame
+from r2p.codecs.rtcan import HIGH_MAX, HIGH_SHIFT, ID8_MAX, MANAGEMENT, MESSAGE_MAX, MESSAGE_SHIFT, NOT_SYNC, Frame
 from r2p.errors import DecodeError, MessageError
 from r2p.protocols.can_orders import Mailbox, Outcome
 from r2p.protocols.rtcan.events import Action, Done, EngineContext, EngineSettings, Fate, Profile, Ready, Received
@@ -46,7 +46,7 @@ from r2p.units import NEVER, SECOND
 
 _NOTHING: tuple[Action, ...] = ()
 # Python 3.11 is slow to find a member of an enum.
-_FIRMWARE, _ELECTING, _LISTENING = Profile.FIRMWARE, Role.ELECTING, Stage.LISTENING
+_FIRMWARE, _RTCAN, _ELECTING, _LISTENING = Profile.FIRMWARE, Profile.RTCAN, Role.ELECTING, Stage.LISTENING
 _SILENT, _FREE, _SLOTTED = Mode
 
 
@@ -177,14 +177,15 @@ class Engine:
             self._on_own_id8(now, identifier)
         if self.node_id.stage is _LISTENING:
             self._learn(identifier)
-        if identifier >> HIGH_SHIFT & HIGH_MAX > MANAGEMENT:
+        high = identifier >> HIGH_SHIFT & HIGH_MAX
+        if high > MANAGEMENT:
             received = self.reassembly.receive(frame, stamp - self._latency)
             if not self._actions:
                 return _NOTHING if received is None else (received,)
             if received is not None:
                 self._actions.append(received)
         elif self._running:
-            self._on_low(now, frame, stamp - self._latency)
+            self._on_low(now, frame, high, stamp - self._latency)
         return self._drain() if self._actions else _NOTHING
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> Sequence[Action]:
@@ -405,12 +406,12 @@ class Engine:
         if message != rtcan.FIRMWARE_MANAGEMENT:
             self.node_id.mark_taken(rtcan.id8_of(message))
 
-    def _on_low(self, now: int, frame: Frame, stamp: int) -> None:
+    def _on_low(self, now: int, frame: Frame, high: int, stamp: int) -> None:
         """Handle a frame of management, or among firmware one of a topic whose high byte is as low as that."""
-        message = rtcan.message_of(frame.id)
-        high = rtcan.high_byte(message)
-        firmware = self.profile is _FIRMWARE
-        self._limiter.on_traffic(now)
+        message, profile = frame.id >> MESSAGE_SHIFT & MESSAGE_MAX, self.detector.profile
+        firmware = profile is _FIRMWARE
+        if profile is not _RTCAN:  # there nothing waits for silence
+            self._limiter.on_traffic(now)
         if high == rtcan.SYNC and not firmware:
             self.counts["management of firmware"] += 1
             # The last frame, of which 0 are left, will look like a sync if its laxity is 0 as well.
