@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals as POSI
 
 PROLOGUE = """
 import asyncio, logging, os, signal, sys, threading, time
-import r2p
+import r2p, r2p.modules.runner
 
 def ready() -> None:
     print("ready", flush=True)
