@@ -23,6 +23,7 @@ from r2p.errors import Closed, Error
 from r2p.protocols.can_orders import Mailbox, Outcome
 from r2p.protocols.rtcan.calendar import Calendar, PeriodRule, Refusal, Reservation, asked_exactly, occupied
 from r2p.protocols.rtcan.cycle import Timing, timing
+from r2p.protocols.rtcan.leases import owners_kept
 from r2p.protocols.rtcan.monitor import BusLoad, BusSlot, FrameKind, Monitor, SeenFrame
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.url import parse
@@ -44,6 +45,7 @@ __all__ = [
     "Timing",
     "asked_exactly",
     "occupied",
+    "owners_kept",
     "timing",
 ]
 

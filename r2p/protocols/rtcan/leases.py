@@ -442,6 +442,11 @@ def frames_needed(owners: int) -> int:
     return _MASTER_FRAMES + _OWNER_FRAMES * owners
 
 
+def owners_kept(free: float) -> int:
+    """Return of how many modules so many free slots a second keep the slots; a master refuses those of others."""
+    return max(0, int(free - _MASTER_FRAMES) // _OWNER_FRAMES)
+
+
 def _set_bits(bits: int) -> Iterable[int]:
     while bits:
         yield (bits & -bits).bit_length() - 1

@@ -25,6 +25,7 @@ from r2p.bus import (
     Reservation,
     Timing,
     asked_exactly,
+    owners_kept,
     timing,
 )
 from r2p.codecs import rtcan
@@ -290,10 +291,13 @@ def summary(calendar: Calendar, grid: Timing) -> str:
     reserved = 1 + sum(each.fragments * grid.slots / each.period for each in calendar)
     left = grid.slots - reserved
     frames = left / grid.cycle * SECOND
-    return (
+    text = (
         f"{reserved:g} of {grid.slots} slots reserved (including the sync), {left:g} left for other traffic:\n"
         f"{frames:.0f} frames/s, {frames * 64 / 1000:.1f} kbit/s of data"
     )
+    if (owners := owners_kept(frames)) < len(list(calendar)):
+        text += f"; they keep the slots of {owners} modules, and the master refuses those of more"
+    return text
 
 
 # The drawing

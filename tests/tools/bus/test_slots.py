@@ -75,6 +75,17 @@ def test_the_networks_of_the_thesis_fill_39_of_59_slots() -> None:
     assert summary(calendar, timing).startswith("40 of 60 slots reserved (including the sync), 20 left")
 
 
+@pytest.mark.parametrize(("slow", "said"), [(5, ""), (10, "; they keep the slots of 0 modules, and the master")])
+def test_what_is_left_says_whose_slots_it_keeps(slow: int, said: str) -> None:
+    """The master refuses what would leave too little for renewals: PROTOCOL.md 6."""
+    plan = [parse(f"a{i}:8@1kHz") for i in range(9)] + [parse(f"b{i}:8@100Hz") for i in range(slow)]
+    timing = grid(60, None, 1_000_000)
+    calendar = Calendar(timing.slots)
+    admit_all(calendar, plan, timing)
+    assert said in summary(calendar, timing)
+    assert ("refuses" in summary(calendar, timing)) is bool(said)
+
+
 def test_a_refusal_has_its_reason_and_another_order_is_told() -> None:
     plan = ["imu:18@200Hz", "a1:8@996us", "a2:8@996us", "a3:8@996us", "a4:8@996us"]
     code, rows, err = admit(*plan, "--periods", "harmonic")
