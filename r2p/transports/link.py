@@ -499,14 +499,10 @@ class Link(abc.ABC):
                 self.stats.lost.guard(self._act, self._events.popleft())
         finally:
             self._acting = False
-        self._acted()
         if not self._closed:
             self._alarm.set(self.discovery.next_deadline())
             if self.gateway_hooks is not None:
                 self.stats.lost.guard(self.gateway_hooks.discovery_changed)
-
-    def _acted(self) -> None:
-        """Send what waits for the end of a turn of discovery."""
 
     def _act(self, event: Event) -> None:
         match event:

@@ -287,7 +287,7 @@ class MemoryLink(BufferedLink):
             takes_together=True,
         )
         self._together: list[bytes] = []
-        """Management messages of this turn."""
+        """Management messages that go to all at the end of this turn of the loop, or before the next sample."""
         self._times_left = TimesLeft()
 
     def connect(self) -> None:
@@ -298,6 +298,7 @@ class MemoryLink(BufferedLink):
 
     def disconnect(self, reason: str = "unplugged") -> None:
         """Unplug the link."""
+        self._send_together()
         self.network.unplug(self._address)
         self.on_down(reason)
 
@@ -335,9 +336,9 @@ class MemoryLink(BufferedLink):
         self.network.send(Datagram(self._address, own_services.topic_of(data), data))
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
+        if not self._together:
+            self._space.loop.call_soon(self._send_together)
         self._together.append(data)
-        if not self._acting:
-            self._send_together()
 
     def write_answer(self, messages: tuple[bytes, ...], to: Hashable) -> None:
         self._send_together()
@@ -345,7 +346,7 @@ class MemoryLink(BufferedLink):
             self.network.send_to(cast("int", to), datagram)
 
     def _send_together(self) -> None:
-        """Send the management messages that the same events have caused."""
+        """Send the management messages of this turn, which are announcements of several topics, mostly."""
         if self._together:
             messages, self._together = tuple(self._together), []
             for datagram in self._datagrams(messages):
@@ -356,9 +357,6 @@ class MemoryLink(BufferedLink):
         if len(messages) > 1 and not self.network.faults:
             return [Datagram(self._address, _MANAGEMENT, b"", together=messages)]
         return [Datagram(self._address, _MANAGEMENT, data) for data in messages]
-
-    def _acted(self) -> None:
-        self._send_together()
 
     def _review_faults(self) -> None:
         """Repeat little, and answer each module alone, while nothing is lost; with a key, all hear what it seals."""
@@ -416,6 +414,7 @@ class MemoryLink(BufferedLink):
 
     def close(self) -> None:
         super().close()
+        self._send_together()
         self.network.unplug(self._address)
 
 

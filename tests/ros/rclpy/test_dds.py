@@ -50,7 +50,8 @@ async def test_a_node_talks_with_nodes_of_rclpy(rclpy_peer: RclpyPeer) -> None:
         peer.ask("talk", node="listener", topic="/imu", value={"header": {"frame_id": "base"}})
         reading: Any = await readings.fetch(LIMIT)
         assert (reading.header.frame_id, reading.orientation.w) == ("base", 1.0)
-        assert peer.ask("graph", node="listener")["nodes"] == ["/robot1/listener", "/talker"]
+        nodes = peer.ask("graph", node="listener")["nodes"]
+        assert {"/robot1/listener", "/talker"} <= set(nodes)  # and maybe those of other tests, which are about to leave
         assert peer.ask("topics_of", node="listener", of="/talker") == {
             "publishers": {"/chatter": ["std_msgs/msg/String"], "/rosout": ["rcl_interfaces/msg/Log"]},
             "subscribers": {"/imu": ["sensor_msgs/msg/Imu"]},
