@@ -206,3 +206,17 @@ async def test_what_a_start_and_a_second_of_rest_cost_each_pair_of_modules() -> 
             rest[count] = (net.counts["delivered"] - delivered) / pairs / 100
     assert start[20] < 1.5 * start[5]
     assert rest[20] < 1.1 * rest[5] < 1.1
+
+
+@pytest.mark.virtual_time
+async def test_modules_that_were_there_before_a_crowd_are_not_taken_for_gone() -> None:
+    """With 80 modules, the rounds of ALIVE take longer than the leases of before."""
+    net = MemoryNetwork()
+    async with AsyncExitStack() as stack:
+        first = [await stack.enter_async_context(r2p.Module(f"A{n}", via=net.transport())) for n in range(3)]
+        await asyncio.sleep(10)
+        for number in range(80):
+            await stack.enter_async_context(r2p.Module(f"B{number}", via=net.transport()))
+        for _ in range(40):
+            await asyncio.sleep(1)
+            assert [len(module.links[0].discovery.modules) for module in first] == [82] * 3

@@ -33,6 +33,8 @@ _KindName = tuple[int, str]
 
 _HELLO_EACH = 3
 """Presences in a crowd of which one has a HELLO: ALIVE extends the lease as well."""
+_HELLO_EACH_TOLD = 12
+"""The same where each one that is new is told."""
 _ANSWERS_AT_ONCE = 256
 """Items said to one module in one turn."""
 _KIND_OF_ROLE = {ROLE_PUBLISHES: ItemKind.PUBLISHER, ROLE_SUBSCRIBES: ItemKind.SUBSCRIBER}
@@ -193,6 +195,7 @@ class Announcer:
             starts = range(0, max(len(items), 1), _ANSWERS_AT_ONCE)
             self._answer = [self._part(items[at : at + _ANSWERS_AT_ONCE]) for at in starts]
         self._answers[source] = deque(self._answer)
+        self._hello_in = 0  # with more modules, rounds may take longer: the others learn the new lease in time
 
     @property
     def has_answers(self) -> bool:
@@ -376,7 +379,7 @@ class Announcer:
     def _is_known(self) -> bool:
         """Return whether an ALIVE is enough this time: in a crowd, which would take it for firmware if it were new."""
         if self._observer or not self._directory.crowd or self._hello_in <= 0:
-            self._hello_in = _HELLO_EACH - 1
+            self._hello_in = (_HELLO_EACH_TOLD if self._directory.has_addresses else _HELLO_EACH) - 1
             return False
         self._hello_in -= 1
         return True

@@ -262,7 +262,10 @@ class Directory:
         known = info.types.get(role, _UNKNOWN)
         if said == known and role in info.typed_at:  # as almost always
             info.typed_at[role] = now
-        elif said != _UNKNOWN and known.fits(said) and not known.covers(said):
+        elif known is _UNKNOWN and said != _UNKNOWN:
+            info.typed_at[role] = now
+            info.set_type(role, said)
+        elif said != _UNKNOWN and not known.covers(said) and known.fits(said):
             if known.fingerprint in {management.ANY_TYPE, said.fingerprint}:
                 info.typed_at[role] = now
             info.set_type(role, known.merged(said))
