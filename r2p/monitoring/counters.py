@@ -83,7 +83,7 @@ class SubscriberCount(msgspec.Struct, eq=False):
 
 
 class ModuleCounters:
-    """The counters of one module. `answers` is None until the first question was answered, or has timed out."""
+    """The counters of one module. `answers` says whether it answers; None before its first answer or time-out."""
 
     def __init__(self) -> None:
         self.answers: bool | None = None

@@ -32,7 +32,7 @@ PUBLISHERS_MAX = 1024
 
 
 class RecordedPublisher(msgspec.Struct, eq=False):
-    """A publisher of a topic. `cls` is None until its type is found; meanwhile its messages wait in `held`.
+    """A publisher of a topic. Until its type is known as `cls`, its messages wait in `held`.
 
     `next` is the sequence number that follows (0: any); `missed` counts those that were left out. `held_since` is in
     monotonic ns.

@@ -194,7 +194,7 @@ class RosDiscovery(DiscoveryProtocol):
         return any(each & CLASS_LATCHES for each in classes)
 
     def set_subscribed(self, topic: str, *, subscribed: bool) -> list[Event]:
-        """Note that messages of this module's publishers reach a ROS subscriber from now on, or none any more."""
+        """Set whether a ROS subscriber receives what this module publishes on a topic."""
         if subscribed == (topic in self._joined) or (subscribed and (topic, ROLE_PUBLISHES) not in self.own):
             return []
         if subscribed:

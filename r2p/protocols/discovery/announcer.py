@@ -34,7 +34,7 @@ _KindName = tuple[int, str]
 _HELLO_EACH = 3
 """Presences in a crowd of which one has a HELLO: ALIVE extends the lease as well."""
 _HELLO_EACH_TOLD = 12
-"""The same where each one that is new is told."""
+"""The same on networks where newcomers are answered one by one."""
 _ANSWERS_AT_ONCE = 256
 """Items said to one module in one turn."""
 _KIND_OF_ROLE = {ROLE_PUBLISHES: ItemKind.PUBLISHER, ROLE_SUBSCRIBES: ItemKind.SUBSCRIBER}

@@ -137,7 +137,7 @@ class Send(msgspec.Struct, frozen=True):
 
 
 class SendTo(msgspec.Struct, frozen=True):
-    """Send these messages to the one module that needs them; only where discovery was told that the link can."""
+    """Send these messages to the module at this address. Only links that have told discovery that they can get it."""
 
     messages: tuple[bytes, ...]
     to: PeerAddress

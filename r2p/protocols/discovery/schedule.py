@@ -29,9 +29,9 @@ CROWD = 5
 CROWD_ROUNDS = 14
 """The most turns of the ring in which the slow ring turns once, reached with as many modules."""
 _LOSSLESS_ROUNDS = 2 * CROWD_ROUNDS
-"""The same where nothing is lost, and those that are new are told everything."""
+"""The same on networks that lose nothing, where newcomers are answered one by one."""
 _TOGETHER = 16
-"""Items that are repeated in one step there."""
+"""The most items that one step repeats on such networks."""
 _PRESENCE_MODULES = 30
 _LOSSLESS_MODULES = 20
 _PRESENCE_MAX = 10
@@ -149,7 +149,7 @@ class Schedule:
         self._quiet = quiet
 
     def set_lossless(self, *, lossless: bool) -> None:
-        """Note whether nothing is lost, and those that are new are told everything: then less is repeated."""
+        """Set whether everything sent arrives and newcomers are answered one by one. If so, less is repeated."""
         if self._lossless and not lossless:
             self._hurry()
         self._lossless = lossless
@@ -307,7 +307,7 @@ class Schedule:
 
     @property
     def _together(self) -> int:
-        """Items in one step: several where nobody waits for any of them."""
+        """The number of items that one step repeats: several if nobody waits for an answer to any of them."""
         return max(1, min(_TOGETHER, len(self._slow))) if self._lossless and not self._ring else 1
 
     @property

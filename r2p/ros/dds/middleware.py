@@ -373,7 +373,7 @@ class DdsMiddleware(Middleware):
         self._user.notice("services", f"{server.service} is not served over DDS: {_NO_SERVICES}", trouble=True)
 
     def unserve(self, server: RosServer) -> None:
-        """Do nothing: there is none."""
+        """Do nothing, as services are not served over DDS."""
 
     async def call(self, node: str, service: str, type: RosService, request: bytes, timeout: float) -> bytes:
         raise ServiceError(f"{service} can't be called over DDS: {_NO_SERVICES}")

@@ -43,7 +43,7 @@ def user_data(checksum: str) -> bytes:
 
 
 def checksum_in(data: bytes) -> str:
-    """Return the hash in the user data of an endpoint; empty if there is none, as from ROS 2 before Iron."""
+    """Return the type hash in an endpoint's user data; empty without one, as ROS 2 before Iron sends none."""
     for entry in data.rstrip(b"\0").decode(errors="replace").split(";"):
         key, _, value = entry.partition("=")
         if key == "typehash":
