@@ -83,6 +83,11 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def generation(self) -> int:
         return self._modules.generation
 
+    @property
+    def known_keys(self) -> "Collection[str]":
+        """The keys of other sessions whose tokens are known."""
+        return self._carried.keys()
+
     # What this module has
 
     def set_flags(self, now: int, flags: int) -> list[Event]:
@@ -257,6 +262,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
     def _add_token(self, now: int, key: str, token: liveliness.Token) -> None:
         self._tokens[key] = token
+        self._refused.note_found()
         if isinstance(token, ModuleToken):
             self._modules.module_appeared(now, key, token)
         elif isinstance(token, SoftwareToken):
@@ -337,8 +343,9 @@ class RefusedTokens:
 
     The network reports each token only once, so refused ones have to be queried when there is room. They are not kept,
     only counted: memory stays bounded. Many answers are work for a router, so this waits until all of them have room,
-    or a quarter of the table is free, and longer and longer where that happens again and again. While the network has
-    more tokens than fit, some stay unknown.
+    or a quarter of the table is free, and longer and longer where that happens again and again. It ends with a query
+    that brings nothing new: under load, one in some thousand ends before its last answers. While the network has more
+    tokens than fit, some stay unknown.
     """
 
     def __init__(self, most: int, spread: int) -> None:
@@ -352,6 +359,7 @@ class RefusedTokens:
         """Tokens of the largest refused pack: with less room, it would be refused again."""
         self._query_at: int | None = None
         self._querying = False
+        self._found = False
         self._pause = _PAUSE_MIN
         self._last_query: int | None = None
 
@@ -364,6 +372,10 @@ class RefusedTokens:
     def remove_one(self) -> None:
         """Note the end of a token that was not kept."""
         self._count = max(0, self._count - 1)
+
+    def note_found(self) -> None:
+        """Note that a token has got a place: if an answer brought it, another one may be missing among the answers."""
+        self._found = True
 
     def clear(self) -> None:
         """Start over: all tokens are gone, and will be reported again."""
@@ -390,7 +402,7 @@ class RefusedTokens:
         self._query_at = None
         if not self._fit(free):
             return False
-        self._any, self._count, self._largest, self._querying = False, 0, 0, True
+        self._any, self._count, self._largest, self._querying, self._found = False, 0, 0, True, False
         self._last_query, self._pause = now, min(2 * self._pause, _PAUSE_MAX)
         return True
 
@@ -398,7 +410,7 @@ class RefusedTokens:
         """Note that the query is over; if not `complete`, some answers may be missing."""
         self._querying = False
         self._count //= 2  # one that came meanwhile may also be among the answers; rather too few than too many
-        self._any = self._any or not complete
+        self._any = self._any or self._found or not complete
 
     def _fit(self, free: int) -> bool:
         # As the count is an estimate, a quarter of the table is enough in any case.

@@ -14,7 +14,7 @@ import asyncio
 import functools
 import itertools
 from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any, ClassVar, cast
 
 from r2p.codecs import UnknownType, liveliness, schemas
@@ -277,7 +277,7 @@ class ZenohLink(Link):
     def _query_tokens(self) -> None:
         """Query all tokens, as zenoh reports each only once, and some were refused."""
         if self._session is not None:
-            self._tokens.begin_query()
+            self._tokens.begin_query(self._liveliness.known_keys)
             prefix = f"{self._prefix}/{liveliness.KEY_PREFIX}"
             self._session.query_tokens(prefix, _TOKENS_TIMEOUT_S, self._token_answers)
 
@@ -357,6 +357,9 @@ class TokenDebouncer:
         self._going: dict[str, asyncio.TimerHandle] = {}
         self._went: set[str] | None = None
         """Tokens that ended since a query began: answers about them may be older than that. None without a query."""
+        self._unconfirmed: set[str] = set()
+        """Tokens that are there, but have not been among the answers."""
+        self._answered = False
 
     def on_change(self, key: str, there: bool) -> None:
         """Note that a token appeared or ended."""
@@ -372,18 +375,26 @@ class TokenDebouncer:
             self._going[key] = self._loop.call_later(_SETTLE_S, self._gone, key)
             self._note_end(key)
 
-    def begin_query(self) -> None:
-        """Note that all tokens are queried: ends from now on are newer than the answers."""
+    def begin_query(self, known: Iterable[str]) -> None:
+        """Note that all tokens are queried: ends from now on are newer than the answers. The `known` ones must be
+        among the answers: under load, zenoh 1.10 ends one in some thousand queries before its answers come.
+        """
         self._went = set(self._going)
+        self._unconfirmed = set(known) - self._went
+        self._answered = False
 
     def on_answer(self, key: str) -> None:
         """Believe a token among the answers, unless it ended meanwhile."""
+        self._answered = True
+        self._unconfirmed.discard(key)
         if self._went is not None and key not in self._went:
             self._settled(key, True)
 
     def end_query(self) -> bool:
         """Return whether the answers are complete and could be used."""
-        usable, self._went = self._went is not None, None
+        # There is always an answer: the session's own token.
+        usable = self._went is not None and self._answered and not self._unconfirmed
+        self._went, self._unconfirmed = None, set()
         return usable
 
     def on_up(self) -> None:
@@ -417,6 +428,7 @@ class TokenDebouncer:
 
     def _note_end(self, key: str) -> None:
         if self._went is not None:
+            self._unconfirmed.discard(key)
             self._went.add(key)
             if len(self._went) > self._most:  # too many to remember: the answers are of no use
                 self._went = None

@@ -39,7 +39,7 @@ async def test_an_answer_that_is_older_than_the_end_of_its_token_is_not_believed
     for key in ("before", "during", "again"):
         believer.tokens.on_change(key, True)
     believer.tokens.on_change("before", False)
-    believer.tokens.begin_query()
+    believer.tokens.begin_query(believer.there)
     for key in ("during", "again"):
         believer.tokens.on_change(key, False)
     await asyncio.sleep(1.0)
@@ -53,7 +53,7 @@ async def test_an_answer_that_is_older_than_the_end_of_its_token_is_not_believed
 
 async def test_answers_are_of_no_use_once_the_link_was_down() -> None:
     believer = Believer()
-    believer.tokens.begin_query()
+    believer.tokens.begin_query(believer.there)
     believer.tokens.on_down()
     believer.tokens.on_up()
     believer.tokens.on_answer("old")
@@ -61,9 +61,30 @@ async def test_answers_are_of_no_use_once_the_link_was_down() -> None:
     assert not believer.there
 
 
+async def test_answers_without_a_token_that_is_there_are_incomplete() -> None:
+    believer = Believer()
+    for key in ("stays", "goes"):
+        believer.tokens.on_change(key, True)
+    believer.tokens.begin_query(believer.there)
+    believer.tokens.on_change("goes", False)
+    believer.tokens.on_answer("new")
+    assert not believer.tokens.end_query()
+    assert "new" in believer.there
+    believer.tokens.begin_query(believer.there)
+    for key in ("new", "stays"):
+        believer.tokens.on_answer(key)
+    assert believer.tokens.end_query()
+
+
+async def test_no_answer_at_all_is_incomplete() -> None:
+    believer = Believer()
+    believer.tokens.begin_query(())
+    assert not believer.tokens.end_query()
+
+
 async def test_answers_are_of_no_use_where_too_many_tokens_go_meanwhile() -> None:
     believer = Believer(most=4)
-    believer.tokens.begin_query()
+    believer.tokens.begin_query(believer.there)
     for number in range(5):
         believer.tokens.on_change(f"{number}", False)
     believer.tokens.on_answer("0")
