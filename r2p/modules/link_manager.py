@@ -47,6 +47,7 @@ from r2p.protocols.discovery.events import (
     ModuleGone,
     ModuleInfo,
     NameConflict,
+    TableFull,
 )
 from r2p.protocols.keys import Verdict
 from r2p.runtime.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
@@ -283,6 +284,10 @@ class LinkManager:
                 logger.error(
                     "link %s returns this module's own messages: switch off local echo at the other end", link.title
                 )
+            case TableFull(most):
+                text = f"there are more topics, modules or endpoints than fit into a table of {most}, and those that "
+                text += f"are silent for longest are forgotten: topics={2 * most} in the URL makes room for more"
+                self.link_notice(link, "table full", text, trouble=True)
             case ModuleChanged():
                 self._link_accepted(link)  # a module that refuses the connection announces nothing
                 self._suspect_conflict(link, event.info)

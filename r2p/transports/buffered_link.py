@@ -20,7 +20,7 @@ from r2p.errors import DecodeError
 from r2p.names import CALLS, LOG, MANAGEMENT, REPLIES
 from r2p.protocols.call_parts import CallAssembler
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, SubscriberJoined, possible_senders
-from r2p.protocols.discovery.session import DiscoveryProtocol
+from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import Sample, Source
 from r2p.runtime.topic import PublisherHandle, Topic
@@ -84,6 +84,12 @@ class BufferedLink(Link):
         """The last message of each publisher that is not announced yet, and its arrival (ns)."""
         self._call_parts = CallAssembler(self.stats.lost)
         self._call_serial = 0
+
+    def limit_tables(self, most: int | None) -> None:
+        """Keep so many topics, endpoints, modules and long names of others, each, if the link's URL says how many."""
+        if most is not None:
+            assert isinstance(self.discovery, Discovery)
+            self.discovery.limit_tables(most)
 
     # For subclasses to implement
 

@@ -25,7 +25,7 @@ from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import DirectedSample, PublisherClass, Sample, Source
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.link import Hub, Transport
-from r2p.transports.url import Url, duration, key_file
+from r2p.transports.url import Url, duration, key_file, table_size
 
 IN_FLIGHT = 1024
 """Places for messages on their way, without which the network is full for senders."""
@@ -427,9 +427,11 @@ class MemoryTransport(Transport):
         network: MemoryNetwork | None = None,
         faults: dict[str, Any] | None = None,
         key: SharedKey | None = None,
+        topics: int | None = None,
     ) -> None:
         self._name = name
         self._key = key
+        self._topics = topics
         self._network = network
         self._faults = faults or {}
 
@@ -439,6 +441,7 @@ class MemoryTransport(Transport):
             setattr(shared, fault, value)
         link = MemoryLink(f"memory:{self._name}", hub, shared)
         link.use_key(self._key)
+        link.limit_tables(self._topics)
         hub.attach(link)
         try:
             link.connect()
@@ -452,12 +455,12 @@ class MemoryTransport(Transport):
 def from_url(url: Url) -> MemoryTransport:
     """`memory:NAME`; options `loss`, `duplicate`, `reorder` (0..1), `delay`, `jitter` (durations), `seed`.
 
-    These hold for the whole network, from now on; `key` for this module.
+    These hold for the whole network, from now on; `key` and `topics` for this module.
     """
     if not url.address:
         raise TransportError(f"{url}: give the network a name: memory:lab")
     faults = url.parsed(_OPTIONS)
-    return MemoryTransport(url.address, None, faults, faults.pop("key", None))
+    return MemoryTransport(url.address, None, faults, faults.pop("key", None), faults.pop("topics", None))
 
 
 def _probability(text: str) -> float:
@@ -484,4 +487,5 @@ _OPTIONS: dict[str, Callable[[str], Any]] = {
     "delay": duration,
     "jitter": duration,
     "seed": _seed,
+    "topics": table_size,
 }

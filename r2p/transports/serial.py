@@ -20,7 +20,7 @@ from r2p.clock import Backoff
 from r2p.errors import TransportError
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
-from r2p.transports.url import Url, key_file
+from r2p.transports.url import Url, key_file, table_size
 
 if TYPE_CHECKING:
     import serial
@@ -43,16 +43,16 @@ _BACKOFF_MAX_S = 0.5  # seconds between attempts to open a device that is not th
 
 
 class SerialTransport(Transport):
-    """`serial:DEVICE`, options `baud` (115200) and `key`."""
+    """`serial:DEVICE`, options `baud` (115200), `key` and `topics`."""
 
     def __init__(self, url: Url) -> None:
-        known: dict[str, Callable[[str], Any]] = {"baud": _baud, "key": key_file}
+        known: dict[str, Callable[[str], Any]] = {"baud": _baud, "key": key_file, "topics": table_size}
         options = url.parsed(known)
         if not url.address:
             raise TransportError(f"{url}: give the device, for example serial:/dev/ttyUSB0")
         self._device = url.address
         self._baud: int = options.get("baud", BAUD)
-        self._key = options.get("key")
+        self._key, self._topics = options.get("key"), options.get("topics")
         self._serial = _pyserial()
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
@@ -65,6 +65,7 @@ class SerialTransport(Transport):
             piecemeal=True,
         )
         link.use_key(self._key)
+        link.limit_tables(self._topics)
         backoff = Backoff(hub.random, longest=_BACKOFF_MAX_S)
         hub.attach(link)
         opened()

@@ -29,7 +29,7 @@ from r2p.protocols.keys import LinkEnd
 from r2p.transports.identify import ServerKind, identify_server
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
-from r2p.transports.url import Url, key_file, yes_or_no
+from r2p.transports.url import Url, key_file, table_size, yes_or_no
 
 PORT = 2323
 """The port where `tcp-listen:` listens, and `tcp:HOST` connects, unless the URL says otherwise."""
@@ -161,7 +161,9 @@ class TcpTransport(Transport):
     """`tcp:HOST:PORT`: connects, and reconnects."""
 
     def __init__(self, url: Url) -> None:
-        self._key = url.parsed({"key": key_file}).get("key")
+        known: dict[str, Callable[[str], Any]] = {"key": key_file, "topics": table_size}
+        options = url.parsed(known)
+        self._key, self._topics = options.get("key"), options.get("topics")
         self._host, self._port = _host_port(url)
         if not self._host:
             raise TransportError(f"{url}: give the other end's address: tcp:HOST:PORT")
@@ -170,6 +172,7 @@ class TcpTransport(Transport):
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         link = LineLink(f"tcp:{_address(self._host, self._port)}", hub)
         link.use_key(self._key, LinkEnd.CLIENT)
+        link.limit_tables(self._topics)
         link.lossless = True
         backoff = Backoff(hub.random)
         hub.attach(link)
@@ -250,12 +253,18 @@ class TcpListenTransport(Transport):
     """
 
     def __init__(self, url: Url) -> None:
-        known: dict[str, Callable[[str], Any]] = {"max_clients": _client_count, "gateways": yes_or_no, "key": key_file}
+        known: dict[str, Callable[[str], Any]] = {
+            "max_clients": _client_count,
+            "gateways": yes_or_no,
+            "key": key_file,
+            "topics": table_size,
+        }
         options = url.parsed(known)
         self.url = url
         self.max_clients = options.get("max_clients", MAX_CLIENTS)
         self.admits_gateways = bool(options.get("gateways", False))
         self.key = options.get("key")
+        self.topics = options.get("topics")
         self.served: set[_ServerConnection] = set()
         self.refused: set[_ServerConnection] = set()
         """Refused connections that are being sent the reason, and have not closed yet."""
@@ -322,6 +331,7 @@ class _ServerConnection(_TcpConnection):
             return None
         link = _ClientLink(peer, self._hub, self._key_refused, self._server.served)
         link.use_key(self._server.key, LinkEnd.SERVER)
+        link.limit_tables(self._server.topics)
         link.lossless = True
         link.transient = True
         link.admits_gateways = self._server.admits_gateways

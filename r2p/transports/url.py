@@ -46,6 +46,7 @@ _IP = frozenset({*ROS, "tcp", "tcp-listen", "zenoh"})
 _OPTIONS = re.compile(r"[?,&]")
 _CAN = re.compile(r"[a-z]*can[0-9]+")
 _CAN_INTERFACES = ("r2psim", "slcan", "socketcan")  # of RTCAN's URLs: rtcan:slcan:/dev/ttyACM0
+_TABLE_MAX = 1_000_000  # some 600 MB of topics
 _CLOSE = 0.65  # how alike a name must be to be suggested (difflib): can and rtcan are 0.75
 
 
@@ -140,6 +141,13 @@ def one_of(*values: str) -> Callable[[str], str]:
 def key_file(text: str) -> SharedKey:
     """Return the key in this file, of the option `key`."""
     return keys.load(text)
+
+
+def table_size(text: str) -> int:
+    """Return the number of entries in each table of discovery, of the option `topics`."""
+    if not text.isdecimal() or not 0 < int(text) <= _TABLE_MAX:
+        raise ValueError(f"give the number of topics that are kept, 1 to {_TABLE_MAX}")
+    return int(text)
 
 
 def yes_or_no(text: str) -> bool:

@@ -44,6 +44,16 @@ def test_a_bad_value_is_named() -> None:
         open_transport("memory:lab,loss=2")
 
 
+@pytest.mark.parametrize(
+    "url", ["tcp:host", "tcp-listen:", "serial:/dev/ttyUSB0", "memory:lab", "rtcan:can0", "sim:lab"]
+)
+@pytest.mark.parametrize("value", ["0", "1000001", "many"])
+def test_tables_have_a_size_that_makes_sense(url: str, value: str) -> None:
+    open_transport(f"{url}?topics=1000000")
+    with pytest.raises(TransportError, match=f"topics={value}: give the number of topics that are kept, 1 to 1000000$"):
+        open_transport(f"{url}?topics={value}")
+
+
 def test_an_unknown_scheme_lists_the_known_ones() -> None:
     with pytest.raises(
         TransportError, match=r"unknown transport 'tpc': use one of dds, memory, .*can, serial, sim, tcp"

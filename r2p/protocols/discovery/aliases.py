@@ -38,8 +38,10 @@ from r2p.protocols.discovery.events import AliasConflict, AliasesDiffer, AliasEv
 from r2p.protocols.timers import KeyedTimers
 from r2p.units import SECOND
 
-NAMES_MAX = 4096
-"""Names of others that are remembered; the one that was learnt first is forgotten for the next one."""
+NAMES_MAX = 16_384
+"""Names of others that are remembered, unless the link's URL says otherwise; the one that was learnt first is forgotten
+for the next one.
+"""
 
 _UNFINISHED_MAX = 256
 """Incomplete names, of which some parts were received."""
@@ -95,6 +97,10 @@ class LinkNames:
 
     def __init__(self, chosen: Mapping[str, str] | None = None, timers: KeyedTimers | None = None) -> None:
         self.emit: Callable[[AliasEvent], None] = lambda _event: None
+        self.counts: Counter[str] = Counter()
+        """Counts of what was dropped, by reason."""
+        self.most = NAMES_MAX
+        """Names that are remembered."""
         self.renames: list[Renamed] = []
         """Changes for what is known of others, to be popped."""
         self._chosen = chosen or {}
@@ -230,12 +236,12 @@ class LinkNames:
 
     # Names of others
 
-    def receive(self, now: int, message: management.LongName, counts: Counter[str]) -> str:
+    def receive(self, now: int, message: management.LongName) -> str:
         """Read a part of a name. Return a short topic of this module that is the alias of another name: it has to be
         announced, so that both modules learn of each other; else an empty string.
         """
         if message.kind not in _VALID:
-            counts["unknown type"] += 1
+            self.counts["unknown type"] += 1
             return ""
         text = self._assemble(message)
         if text is None:
@@ -245,7 +251,7 @@ class LinkNames:
         valid = len(name) <= longest and pattern.fullmatch(name) is not None
         valid = valid and management.long_name_number(text) == message.number
         if not valid or (chosen and not (message.kind == KIND_TOPIC and fits_field(alias) and len(name) > field)):
-            counts["impossible name"] += 1
+            self.counts["impossible name"] += 1
             return ""
         if not chosen:
             alias = topic_alias(name) if message.kind == KIND_TOPIC else node_alias(name)
@@ -293,7 +299,7 @@ class LinkNames:
         known = self._learnt.get(key)
         if known is None:
             self._learnt[key] = name
-            _bound(self._learnt, NAMES_MAX)
+            _bound(self._learnt, self.most, self.counts)
             self._rename(kind, alias, name)
         elif known == name:
             return
@@ -325,8 +331,11 @@ class LinkNames:
 class ModuleAliases:
     """The names of modules that are too long for a message: an alias travels, which NAME explains."""
 
-    def __init__(self, module: str) -> None:
-        """`module` is the name of this module."""
+    def __init__(self, module: str, counts: Counter[str]) -> None:
+        """`module` is the name of this module; `counts` get what was dropped."""
+        self.most = NAMES_MAX
+        """Names that are remembered."""
+        self._counts = counts
         self._module = module
         self._alias = module_alias(module)
         self._names: dict[str, str] = {}
@@ -356,7 +365,7 @@ class ModuleAliases:
         known = self.name_of(message.alias)
         if known == message.alias != self._alias:
             self._names[message.alias] = name
-            _bound(self._names, NAMES_MAX)
+            _bound(self._names, self.most, self._counts)
         elif known != name:
             self._others[message.alias] = name
             _bound(self._others, _RIVALS_MAX)
@@ -369,6 +378,8 @@ class ModuleAliases:
         return self._others.get(alias, "") if known in (name, alias) else known
 
 
-def _bound(table: dict[Any, Any], most: int) -> None:
+def _bound(table: dict[Any, Any], most: int, counts: Counter[str] | None = None) -> None:
     while len(table) > most:
         del table[next(iter(table))]
+        if counts is not None:
+            counts["names forgotten"] += 1

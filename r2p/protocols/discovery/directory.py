@@ -8,20 +8,20 @@ messages pushes out true entries only until they are repeated.
 
 import copy
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import TypeVar
 
 import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, TopicType
+from r2p.protocols.discovery.events import Event, ModuleInfo, PeerAddress, TableFull, TopicType
 from r2p.protocols.discovery.schedule import CROWD, CROWD_ROUNDS, SLOW_ROUNDS
 from r2p.protocols.timers import KeyedTimers
 from r2p.units import MILLISECOND, NEVER, SECOND
 
 TABLE_MAX = 16_384
-"""Entries in each table."""
+"""Entries in each table, unless the link's URL says otherwise."""
 
 LEASE = 5 * SECOND
 """Shortest lease of an r2p module (ns), whatever its HELLO says: some more than three rounds of repetition."""
@@ -106,7 +106,11 @@ class _Starts(msgspec.Struct):
 class Directory:
     """The tables of one link. Each endpoint has a timer, ("endpoint", its key), after which it is forgotten."""
 
-    def __init__(self, timers: KeyedTimers, counts: Counter[str]) -> None:
+    def __init__(
+        self, timers: KeyedTimers, counts: Counter[str], emit: Callable[[Event], object] = lambda _event: None
+    ) -> None:
+        self.most = TABLE_MAX
+        """Entries in each table."""
         self.modules: dict[str, ModuleInfo] = {}
         self.topics: dict[str, TopicInfo] = {}
         self.endpoints: dict[EndpointKey, EndpointInfo] = {}
@@ -125,6 +129,8 @@ class Directory:
         self._names: dict[int, str] = {}
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
         self._starts: dict[str, _Starts] = {}
+        self._emit = emit
+        self._said_full = False
         self._others = 0  # modules on the link itself that do not know crowds: firmware, or r2p of before
 
     @property
@@ -338,11 +344,18 @@ class Directory:
         """Enter a value as the latest one; return the one that was forgotten for it. A dict keeps the order."""
         table.pop(key, None)  # to enter it as the last one again
         forgotten = None
-        if len(table) >= TABLE_MAX:
+        if len(table) >= self.most:
             forgotten = table.pop(next(iter(table)))
-            self.counts[reason] += 1
+            self.note_forgotten(reason)
         table[key] = value
         return forgotten
+
+    def note_forgotten(self, reason: str) -> None:
+        """Count an entry for which there was no room, and report the first one."""
+        self.counts[reason] += 1
+        if not self._said_full:
+            self._said_full = True
+            self._emit(TableFull(self.most))
 
     def _enter_direct(self, info: ModuleInfo) -> None:
         if info.hops == 0:
@@ -402,7 +415,9 @@ def decrement(counter: Counter[K], key: K) -> bool:
 class Demand:
     """Topics by role (ROLE_...), and the sources that publish or subscribe to them: peers, or sessions of zenoh."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = TABLE_MAX) -> None:
+        """`most` topics are kept, and so many sources of each."""
+        self._most = most
         self._sources: dict[_TopicRole, dict[Hashable, None]] = {}
         self._changed: set[str] = set()
 
@@ -431,11 +446,11 @@ class Demand:
         """Enter a source; return False if the table is full."""
         sources = self._sources.get((topic, role))
         if sources is None:
-            if len(self._sources) >= TABLE_MAX:
+            if len(self._sources) >= self._most:
                 return False
             sources = self._sources[topic, role] = {}
             self._changed.add(topic)
-        if source not in sources and len(sources) >= TABLE_MAX:
+        if source not in sources and len(sources) >= self._most:
             return False
         sources[source] = None
         return True
@@ -457,7 +472,7 @@ class LeasedDemand(Demand):
     """
 
     def __init__(self, directory: Directory) -> None:
-        super().__init__()
+        super().__init__(directory.most)
         self._timers = directory.timers
         self._directory = directory
         self._permanent: dict[PeerAddress, dict[_TopicRole, None]] = {}

@@ -263,6 +263,14 @@ class EchoDetected(msgspec.Struct, frozen=True):
     """The line echoes this module's own messages."""
 
 
+class TableFull(msgspec.Struct, frozen=True):
+    """A table of discovery has had no room for the first time: of its `most` entries, those that are silent for longest
+    are forgotten from now on.
+    """
+
+    most: int
+
+
 class ModuleChanged(msgspec.Struct, frozen=True):
     """A module is new, or anything but the time of its last message has changed."""
 
@@ -339,6 +347,7 @@ Event = (
     | CommandDenied
     | ConnectionDenied
     | EchoDetected
+    | TableFull
     | ModuleChanged
     | ModuleGone
     | Declare

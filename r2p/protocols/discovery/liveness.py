@@ -52,7 +52,8 @@ class PeerLiveness:
         self._timers = directory.timers
         self._outbox = announcer.outbox
         self._counts = directory.counts
-        self._aliases = ModuleAliases(announcer.module)
+        self.aliases = ModuleAliases(announcer.module, directory.counts)
+        """The names of modules that are too long for a message."""
         self._unnamed: dict[str, None] = {}
         """Aliases of modules whose names have not been received yet."""
         self._echoing_until = 0
@@ -62,11 +63,11 @@ class PeerLiveness:
 
     def name(self, now: int, message: management.Name, source: PeerAddress) -> None:
         """Handle NAME: a module known by its alias gets its name."""
-        name = self._aliases.receive(message)
-        if self._aliases.name_of(message.alias) != message.alias:
+        name = self.aliases.receive(message)
+        if self.aliases.name_of(message.alias) != message.alias:
             self._unnamed.pop(message.alias, None)
         info = self._directory.modules.get(message.alias)
-        if name is not None and (other := self._aliases.other_name(name)):
+        if name is not None and (other := self.aliases.other_name(name)):
             if self._admit_report(now, f"alias {message.alias}"):
                 self._outbox.emit(AliasConflict(KIND_MODULE, message.alias, other, name))
         elif name is not None and info is not None and (info.hops or not info.r2p):
@@ -160,11 +161,11 @@ class PeerLiveness:
 
     def module_behind(self, alias: str) -> str:
         """Return the name that an alias stands for; the alias itself if it is a name, or its name is unknown."""
-        return self._aliases.name_of(alias)
+        return self.aliases.name_of(alias)
 
     def other_module(self, name: str) -> str:
         """Return another module that has the same alias; empty without one."""
-        return self._aliases.other_name(name)
+        return self.aliases.other_name(name)
 
     def _is_possible(self, name: str) -> bool:
         if "/" not in name:
@@ -173,7 +174,7 @@ class PeerLiveness:
         return False
 
     def _with_name(self, message: _M) -> _M:
-        name = self._aliases.name_of(message.module)
+        name = self.aliases.name_of(message.module)
         return message if name == message.module else msgspec.structs.replace(message, module=name)
 
     def _is_short(self, name: str) -> bool:

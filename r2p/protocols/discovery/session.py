@@ -327,9 +327,9 @@ class Discovery(DiscoveryProtocol):
         self._timers = KeyedTimers()
         self._names = LinkNames(aliases, self._timers)
         super().__init__(module, instance, counts, self._names)
-        self._names.emit = self._outbox.emit
+        self._names.emit, self._names.counts = self._outbox.emit, self.counts
         self._schedule = Schedule(rate, burst, 0)
-        self._directory = Directory(self._timers, self.counts)
+        self._directory = Directory(self._timers, self.counts, self._outbox.emit)
         self.modules = self._directory.modules
         self.topics = self._directory.topics
         self.endpoints = self._directory.endpoints
@@ -358,6 +358,10 @@ class Discovery(DiscoveryProtocol):
         }
 
     # What is known of the link
+
+    def limit_tables(self, most: int) -> None:
+        """Set how many topics, endpoints, modules and long names of others are kept, each."""
+        self._directory.most = self._names.most = self._liveness.aliases.most = most
 
     @property
     def sole_peer(self) -> int | None:
@@ -416,7 +420,7 @@ class Discovery(DiscoveryProtocol):
 
     def _long_name(self, now: int, message: management.LongName, source: PeerAddress) -> None:
         """Handle LONG_NAME: rename everything that is known under this alias."""
-        short = self._names.receive(now, message, self.counts)
+        short = self._names.receive(now, message)
         if short and not self._observer:  # the user of a tool may ask for a topic by its alias
             self._announcer.announce_name(KIND_TOPIC, short)
         renames, self._names.renames = self._names.renames, []

@@ -76,7 +76,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         """How many more keys have a token, of those that several have."""
         self.tokens_max = TOKENS_MAX if tokens_max is None else tokens_max
         self._refused = RefusedTokens(self.tokens_max, instance)
-        self._aliases = ModuleAliases(module)
+        self._aliases = ModuleAliases(module, self.counts)
         self._marked_at = 0
 
     @property

@@ -21,7 +21,7 @@ from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, Transport
 from r2p.transports.rtcan.bus_topics import BusReporter
 from r2p.transports.rtcan.link import RtcanLink
-from r2p.transports.url import Url, duration, key_file
+from r2p.transports.url import Url, duration, key_file, table_size
 from r2p.units import SECOND
 
 # fmt: off
@@ -47,7 +47,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
     `id`: 1 to 255; None: claim a free one. `priority`: 0 to 255, to be the master; 0: never. `slots`, `cycle` (nominal)
     and `bitrate` must be the same in the whole network. `profile`: auto, rtcan or firmware-2014. `utc`: how far the
     module's UTC may be off, if it is known: as the master it distributes UTC. `periods`: as the master, which ones it
-    admits together. `key`: shared by those that give orders.
+    admits together. `key`: shared by those that give orders. `topics`: of others, that are kept.
     """
 
     id: int | None = None
@@ -59,6 +59,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
     utc: float | None = None
     periods: PeriodRule = PeriodRule.COMMON_FACTORS
     key: SharedKey | None = None
+    topics: int | None = None
 
     @property
     def timing(self) -> Timing:
@@ -121,6 +122,7 @@ async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanP
     utc_error = None if options.utc is None else round(options.utc * SECOND)
     link = RtcanLink(name, hub, port, settings, utc_error)
     link.use_key(options.key)
+    link.limit_tables(options.topics)
     hub.attach(link)
     running = asyncio.create_task(port.run(link.driver, opened), name=f"{name} port")
     reporter = BusReporter(link, hub)
@@ -224,5 +226,6 @@ OPTIONS: dict[str, Callable[[str], Any]] = {
     "utc": duration,
     "periods": _one_of(PeriodRule),
     "key": key_file,
+    "topics": table_size,
 }
 """Converters for `Url.parsed`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,7 +12,6 @@ from hypothesis import strategies as st
 from r2p.codecs import management as m
 from r2p.names import chosen_alias, module_alias, module_path, node_alias, topic_alias
 from r2p.protocols.discovery.aliases import ModuleAliases
-from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import AliasConflict, AliasesDiffer, AliasFreed, Event, PublisherFound
 from r2p.protocols.discovery.session import Discovery
 from tests.protocols.discovery.wire import ME, ONE, PC2, PEER, S, changes_in, hear, run, sent
@@ -281,10 +281,12 @@ def test_a_piece_of_another_name_completes_none() -> None:
 
 def test_made_up_names_are_bounded() -> None:
     discovery, _ = module_with()
+    discovery.limit_tables(100)
     names = discovery._names
-    for number in range(TABLE_MAX + 500):
+    for number in range(600):
         hear(discovery, S, *claims(f"made_up_topics/{number}"), m.LongName(1, 0x0F, number, "part"))
-    assert len(names._learnt) <= TABLE_MAX
+    assert len(names._learnt) == 100
+    assert discovery.counts["names forgotten"] == 500
     assert len(names._parts) <= 256
 
 
@@ -300,7 +302,7 @@ def test_short_names_are_their_own_aliases() -> None:
 
 @pytest.mark.parametrize("name", MODULES)
 def test_the_name_of_a_module_travels_in_pieces(name: str) -> None:
-    aliases = ModuleAliases("PC1")
+    aliases = ModuleAliases("PC1", Counter())
     alias = module_alias(module_path(name))
     assert len(alias) <= 7
     assert aliases.name_of(alias) == alias
@@ -311,19 +313,22 @@ def test_the_name_of_a_module_travels_in_pieces(name: str) -> None:
 
 
 def test_an_alias_that_does_not_fit_is_not_believed() -> None:
-    aliases = ModuleAliases("PC1")
+    aliases = ModuleAliases("PC1", Counter())
     assert aliases.receive(m.Name("MOTOR1", 0, "robot1/MOTOR1")) is None
     assert aliases.name_of("MOTOR1") == "MOTOR1"
 
 
 def test_made_up_aliases_of_modules_are_bounded() -> None:
     own = "front_left_wheel_controller"
-    aliases = ModuleAliases(own)
-    for number in range(10_000):
+    counts: Counter[str] = Counter()
+    aliases = ModuleAliases(own, counts)
+    aliases.most = 100
+    for number in range(1000):
         name = f"robot/{number}"
         aliases.receive(m.Name(module_alias(name), 0, name))
         aliases.receive(m.Name(f"x{number}", 0x0F, "part"))
-    assert len(aliases._names) <= 4096
+    assert len(aliases._names) == 100
+    assert counts == {"names forgotten": 900}
     assert len(aliases._parts) <= 256
     assert aliases.name_of(module_alias(own)) == own
 

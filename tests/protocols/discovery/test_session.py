@@ -5,11 +5,11 @@ import itertools
 import pytest
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery import directory
 from r2p.protocols.discovery.events import (
     Command,
     Event,
     ModuleGone,
+    TableFull,
 )
 from r2p.protocols.discovery.session import Discovery
 from tests.protocols.discovery.wire import (
@@ -213,9 +213,9 @@ class TestHostile:
         assert discovery.receive(S, data) == []
         assert discovery.counts == {reason: 1}
 
-    def test_tables_are_bounded(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(directory, "TABLE_MAX", 10)
+    def test_tables_are_bounded(self) -> None:
         discovery = started()
+        discovery.limit_tables(10)
         demand = discovery.demand()
         events: list[Event] = []
         for n in range(30):
@@ -223,6 +223,7 @@ class TestHostile:
             events += hear(discovery, S + n, *flood, source=n)
         assert len(discovery.modules) == len(discovery.topics) == len(discovery.endpoints) == 10
         assert "x29" in discovery.modules
+        assert [event for event in events if isinstance(event, TableFull)] == [TableFull(10)]
         assert sum(isinstance(event, ModuleGone) for event in events) == 20
         assert discovery.counts["modules forgotten"] == 20
         assert discovery.counts["topics forgotten"] == discovery.counts["topics not forwarded"] == 20
