@@ -1,7 +1,7 @@
 """How our own async tests get their loop.
 
 `@pytest.mark.virtual_time` runs under virtual time: the normal case. `@pytest.mark.anyio` is for what needs real I/O or
-real threads: it runs twice, on asyncio's loop and on uvloop's.
+real threads: it runs twice, on asyncio's loop and on uvloop's; with `@pytest.mark.one_loop` once.
 """
 
 from __future__ import annotations
@@ -47,6 +47,22 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out uvloop where it is not used, or does not matter."""
+    left_out = {item for item in items if _is_on_uvloop(item) and _needs_one_loop(item)}
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if item not in left_out]
+
+
+def _is_on_uvloop(item: pytest.Item) -> bool:
+    spec = getattr(item, "callspec", None)
+    return spec is not None and bool(spec.params.get("anyio_backend"))
+
+
+def _needs_one_loop(item: pytest.Item) -> bool:
+    return any(item.get_closest_marker(name) is not None for name in ("virtual_time", "one_loop"))
 
 
 class _Kept(logging.Handler):

@@ -22,7 +22,7 @@ from tests.can.rig import Candump, cangen, cansend, ip, until
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = [pytest.mark.can, pytest.mark.anyio]
+pytestmark = [pytest.mark.can, pytest.mark.anyio, pytest.mark.one_loop]
 
 
 async def test_every_kind_of_frame_is_in_the_file(vcan: str, tmp_path: Path) -> None:

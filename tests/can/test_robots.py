@@ -14,7 +14,7 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-pytestmark = [pytest.mark.can, pytest.mark.anyio]
+pytestmark = [pytest.mark.can, pytest.mark.anyio, pytest.mark.one_loop]
 
 LONGEST = 120.0
 """Seconds; three interpreters have to start on one slow CPU."""

@@ -19,7 +19,7 @@ from tests.can.rig import GUARD, Candump, cansend, ip, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-pytestmark = [pytest.mark.can, pytest.mark.anyio]
+pytestmark = [pytest.mark.can, pytest.mark.anyio, pytest.mark.one_loop]
 
 MANAGEMENT = 0x0000
 OPAQUE = 0x1707

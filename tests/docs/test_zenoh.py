@@ -85,6 +85,7 @@ def test_there_are_configurations() -> None:
 
 
 @pytest.mark.anyio
+@pytest.mark.one_loop
 @guarded
 async def test_certificates(folder: Folder) -> None:
     certificates("robot1", "laptop")
@@ -96,6 +97,7 @@ async def test_certificates(folder: Folder) -> None:
 
 
 @pytest.mark.anyio
+@pytest.mark.one_loop
 @guarded
 async def test_passwords(folder: Folder) -> None:
     users("alice:secret")
@@ -107,6 +109,7 @@ async def test_passwords(folder: Folder) -> None:
 
 
 @pytest.mark.anyio
+@pytest.mark.one_loop
 @guarded
 async def test_guests_may_look_but_neither_drive_nor_stop(folder: Folder) -> None:
     certificates("robot1", "laptop", "guest")

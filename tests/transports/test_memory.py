@@ -174,6 +174,29 @@ async def test_one_who_is_new_is_told_everything_alone() -> None:
 
 
 @pytest.mark.virtual_time
+async def test_topics_are_said_once_and_with_their_types() -> None:
+    """Also those of modules that start together, when none knows the others yet; what a module had in its fast ring
+    before it knew them is said once more.
+    """
+    net = MemoryNetwork()
+    listener = Listener(net)
+    names = [f"M{number}" for number in range(8)]
+    async with AsyncExitStack() as stack:
+        modules = [await stack.enter_async_context(r2p.Module(name, via=net.transport())) for name in names]
+        for name, module in zip(names, modules, strict=True):
+            node = await stack.enter_async_context(node_in(module))
+            for number in range(10):
+                node.advertise(f"{name}/t{number}", Float32)
+        await asyncio.sleep(0.1)
+        for module in modules:
+            known = module.links[0].discovery.topics
+            types = [known[f"{name}/t{n}"].fingerprint for name in names if name != module.name for n in range(10)]
+            assert set(types) == {r2p.layout(Float32).fingerprint}
+        await asyncio.sleep(20)
+    assert sum(listener.advertised.values()) <= 80 + len(names)
+
+
+@pytest.mark.virtual_time
 async def test_what_is_said_is_repeated_again_when_something_may_be_lost() -> None:
     net = MemoryNetwork()
     async with publisher_of(net, "A"), publisher_of(net, "B"):

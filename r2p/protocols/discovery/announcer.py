@@ -362,7 +362,8 @@ class Announcer:
     def _with_type(
         self, own: LocalTopic, topic: str, role: int, messages: list[management.Management]
     ) -> list[management.Management]:
-        if self.r2p:
+        # What is announced once is announced with its type, also before the first r2p module is known.
+        if self.r2p or self._directory.has_addresses:
             return [own.type_info(topic, role), *messages]
         return [] if own.type.varies else messages  # gateways of firmware would make buffers for messages of one size
 

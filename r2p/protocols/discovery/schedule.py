@@ -266,7 +266,7 @@ class Schedule:
             self._step_at = now + self._interval
         if presence:
             return self._presence(now)
-        return self._repetition()
+        return self._repetition(now)
 
     def announced(self) -> list[Item]:
         """Return what is repeated, but for items that still wait for their first turn; names come first."""
@@ -346,7 +346,7 @@ class Schedule:
         self._presence_sent, self._presence_at = now, now + self._presence_period
         return Item(ItemKind.PRESENCE, once=True)
 
-    def _repetition(self) -> Item:
+    def _repetition(self, now: int) -> Item:
         """The next item of the ring, or of the slow ring so often that it turns once in `_rounds`."""
         ring, slow = self._ring, self._slow
         if not self._eager:
@@ -363,6 +363,8 @@ class Schedule:
         self._lap -= 1
         if self._lap == 0:
             self._slow_down()
+            if self._lossless:
+                self._step_at = now + self._interval  # what the fast ring had is not repeated at its pace
         return item
 
     def _announced(self, item: Item) -> None:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from r2p.sim.modules import Wire
     from r2p.transports.link import Transport
 
+pytestmark = pytest.mark.one_loop
+
 
 def imu() -> FirmwareModule:
     """Counts its messages, and gives commands back."""

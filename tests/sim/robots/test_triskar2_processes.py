@@ -23,6 +23,7 @@ LONGEST = 60.0  # seconds
 
 @pytest.mark.processes
 @pytest.mark.anyio
+@pytest.mark.one_loop
 async def test_it_drives_with_its_motors_in_another_process() -> None:
     motors = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "tests.sim.robots.motors"), cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE

@@ -19,7 +19,7 @@ from tests.transports.test_conformance import first, other, until
 from tests.transports.zenoh.cable import Net, guarded, module
 from tests.transports.zenoh.peer import MODULES, TOPICS, Page
 
-pytestmark = [pytest.mark.anyio, pytest.mark.processes]
+pytestmark = [pytest.mark.anyio, pytest.mark.one_loop, pytest.mark.processes]
 
 Process = asyncio.subprocess.Process
 

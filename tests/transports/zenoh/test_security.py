@@ -16,7 +16,7 @@ from tests.transports.test_conformance import first, other, until
 from tests.transports.zenoh.authority import Authority
 from tests.transports.zenoh.cable import guarded, module
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.one_loop]
 
 
 class Secured:
