@@ -9,7 +9,15 @@ import msgspec
 
 from benchmarks.growth.curve import Curve
 
-PARTS = ("memory_modules", "zenoh_modules", "zenoh_network", "tcp_clients", "gateway_topics", "router_mesh")
+PARTS = (
+    "memory_modules",
+    "rtcan_modules",
+    "zenoh_modules",
+    "zenoh_network",
+    "tcp_clients",
+    "gateway_topics",
+    "router_mesh",
+)
 
 
 def _show(curve: Curve) -> None:

@@ -7,6 +7,7 @@ checked, and then left out.
 
 import asyncio
 import contextlib
+import importlib
 import re
 import runpy
 import subprocess
@@ -57,7 +58,7 @@ def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     def run_coroutine(main: Coroutine[Any, Any, T]) -> T | None:
         return run_bounded(lambda: main)
 
-    monkeypatch.setattr(sys.modules["r2p.modules.runner"], "run_main", run_bounded)
+    monkeypatch.setattr(importlib.import_module("r2p.modules.runner"), "run_main", run_bounded)
     monkeypatch.setattr("r2p.run_main", run_bounded)
     monkeypatch.setattr("r2p.modules.module.open_transport", open_here)
     monkeypatch.setattr(asyncio, "run", run_coroutine)

@@ -101,8 +101,7 @@ class LinkNames:
         """Counts of what was dropped, by reason."""
         self.most = NAMES_MAX
         """Names that are remembered."""
-        self.renames: list[Renamed] = []
-        """Changes for what is known of others, to be popped."""
+        self._renames: list[Renamed] = []
         self._chosen = chosen or {}
         self._timers = KeyedTimers() if timers is None else timers
         self._own: dict[_Key, str] = {}
@@ -265,6 +264,11 @@ class LinkNames:
         if kind == KIND_TOPIC and key in self._own:
             self.emit(AliasFreed(self._own[key]))
 
+    def pop_renames(self) -> list[Renamed]:
+        """Return the changes for what is known of others, since the last call."""
+        renames, self._renames = self._renames, []
+        return renames
+
     def _assemble(self, message: management.LongName) -> str | None:
         """Enter a part of a text; return the text if it is complete."""
         number, last = management.split_part(message.part)
@@ -313,7 +317,7 @@ class LinkNames:
 
     def _rename(self, kind: int, old: str, new: str) -> None:
         if old != new:
-            self.renames.append(Renamed(kind, old, new))
+            self._renames.append(Renamed(kind, old, new))
 
     def _contest(self, now: int, key: _Key, name: str, rival: str, *, refused: str = "") -> None:
         """Note that an alias has two names, and report it once."""

@@ -423,8 +423,7 @@ class Discovery(DiscoveryProtocol):
         short = self._names.receive(now, message)
         if short and not self._observer:  # the user of a tool may ask for a topic by its alias
             self._announcer.announce_name(KIND_TOPIC, short)
-        renames, self._names.renames = self._names.renames, []
-        for change in renames:
+        for change in self._names.pop_renames():
             self._directory.rename(now, change.kind, change.old, change.new)
             if self._demand is not None and change.kind == KIND_TOPIC:
                 self._demand.rename(now, change.old, change.new)
