@@ -66,6 +66,12 @@ class _File:
         for function in self.nodes:  # those inside come later, and win
             if isinstance(function, Function):
                 self.around.update(dict.fromkeys(ast.walk(function), function))
+        self.calls: dict[str, list[ast.Call]] = {}
+        """By the last part of the name that is called."""
+        for node in self.nodes:
+            match node:
+                case ast.Call(func=ast.Attribute(attr=name) | ast.Name(id=name)):
+                    self.calls.setdefault(name, []).append(node)
         self.constants = {
             target.id: node.value
             for node in self.tree.body
@@ -184,9 +190,7 @@ def _passed(file: _File, function: Function, name: str, place: int) -> Iterator[
     names = (function.name, f"_{function.name}")
     method = bool(function.args.args) and function.args.args[0].arg == "self"
     for each in [file] if function.name.startswith("_") else _files():
-        for node in each.nodes:
-            if not isinstance(node, ast.Call) or ast.unparse(node.func).rpartition(".")[2] not in names:
-                continue
+        for node in (call for called in names for call in each.calls.get(called, ())):
             if place - method < len(node.args):
                 yield each, node.args[place - method]
             yield from ((each, keyword.value) for keyword in node.keywords if keyword.arg == name)

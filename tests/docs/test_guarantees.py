@@ -8,6 +8,8 @@ import r2p
 from tests.docs.blocks import ROOT
 from tests.docs.reasons import Reasons
 
+pytestmark = pytest.mark.xdist_group("guarantees")  # what the code counts is found once
+
 PAGE = (ROOT / "docs" / "guarantees.md").read_text()
 
 _TABLE = re.compile(r"^\| (?P<kind>[a-z ]+) \|.*\n\|[ |-]+\n(?P<rows>(?:\|.*\n)+)", re.MULTILINE)
