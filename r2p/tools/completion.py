@@ -45,7 +45,7 @@ async def find(settings: Settings, source: Source) -> list[str]:
         session.module.query()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_LISTEN):
-                await session.settled()
+                await session.announcements.settled()
         return sorted(set(await source(session)))
 
 

@@ -356,11 +356,11 @@ async def try_link(session: Session) -> AsyncIterator[Check]:
             yield Check("connects", False, reason, _advice(url, _CONNECTING))
             return
         yield Check("connects", True, f"after {asyncio.get_running_loop().time() - started:.1f} s")
-        await session.settled()
+        await session.announcements.settled()
         if keys := _refused_keys(session):
             yield keys
             return
-        await wait_until(lambda: bool(_named(session)) or not session.may_have_firmware(), _ROUND)
+        await wait_until(lambda: bool(_named(session)) or not session.announcements.may_have_firmware(), _ROUND)
         others = ros_checks.nodes(session) if is_ros(url) else _received(session, url)
         for check in (*others, *_losses(session), *map(_notice, notices.values())):
             yield check

@@ -70,6 +70,9 @@ async def info(session: Session, module: Name, *, wait: Wait = None, format: For
     output = Output(format)
     module_path(module)
     await session.settle(wait, of="modules")
+    if wait is None:
+        with session.waiting(f"module {module}"):
+            await session.look_for(lambda: _find(session, module) is not None)
     view = _find(session, module)
     if view is None:
         raise r2p.Error(unknown_module(session, module))
@@ -156,7 +159,7 @@ class _CommandSender:
         self._command = command
         self._progress = CommandProgress(command, view, name)
         self._sent_at = 0.0
-        self._settled = asyncio.create_task(session.settled())
+        self._heard_all = asyncio.create_task(session.announcements.heard_all())
         self._firmware_heard_at = asyncio.get_running_loop().time() + _ROUND  # by then each has sent ALIVE
 
     @property
@@ -165,7 +168,7 @@ class _CommandSender:
         return self._progress.name
 
     def close(self) -> None:
-        self._settled.cancel()
+        self._heard_all.cancel()
 
     def awaited(self) -> str:
         """Say what the command waits for."""
@@ -218,13 +221,13 @@ class _CommandSender:
 
     def _is_unknown(self) -> bool:
         """Return whether the module would have been heard by now."""
-        if self._progress.flags or not self._settled.done():
+        if self._progress.flags or not self._heard_all.done():
             return False
         return not self._may_be_firmware() or asyncio.get_running_loop().time() >= self._firmware_heard_at
 
     def _may_be_firmware(self) -> bool:
         on_bus = any(link.up and link.has_slots for link in self._session.module.links)
-        return on_bus or self._session.may_have_firmware()
+        return on_bus or self._session.announcements.may_have_firmware()
 
     def _confirmed(self) -> bool:
         since = asyncio.get_running_loop().time() - self._sent_at

@@ -14,7 +14,7 @@ import r2p
 from r2p.names import node_alias
 from r2p.tools import node_control, session
 from r2p.tools.completion import complete_node
-from r2p.tools.node_states import node_lists, r2p_modules
+from r2p.tools.node_states import is_module, node_lists, r2p_modules
 from r2p.tools.options import CLASS_NAMES, All, Format, Wait
 from r2p.tools.output import Output
 from r2p.tools.session import Session, alias_or_none
@@ -94,6 +94,8 @@ async def info(
     """
     output = Output(format)
     await session.settle(wait)
+    if wait is None and (named := node.rpartition("/")[0]):
+        await is_module(session, named)
     nodes = _nodes(session)
     lists = await node_lists(session, r2p_modules(session))
     for path in ((module, each.node) for module, found in lists.items() for each in found.nodes):

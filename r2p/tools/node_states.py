@@ -6,9 +6,8 @@ import difflib
 import r2p
 from r2p.names import module_path, node_name
 from r2p.tools.output import notify
-from r2p.tools.session import Session, TimedOut, UsageError, wait_until
+from r2p.tools.session import Session, TimedOut, UsageError
 
-_FOUND_WITHIN = 8.0  # seconds in which a module has been announced, through gateways as well
 _AT_ONCE = 8  # modules that are asked at the same time
 
 
@@ -62,6 +61,7 @@ async def module_of(session: Session, node: str) -> str:
     """
     _check_network(session)
     await session.settle()
+    await session.look_for(lambda: bool(r2p_modules(session)))
     modules = r2p_modules(session)
     lists = await node_lists(session, modules)
     paths = [f"{module}/{each.node}" for module, found in lists.items() for each in found.nodes]
@@ -96,13 +96,8 @@ async def is_module(session: Session, name: str) -> bool:
     """Wait until a module of this name is known, or all have been announced, and return whether there is one."""
     _check_network(session)
     await session.settle(wait=0)
-    session.module.query()
-    settled = asyncio.create_task(session.settled())
-    try:
-        await wait_until(lambda: settled.done() or bool(_views(session, name)), _FOUND_WITHIN)
-    finally:
-        settled.cancel()
-    return bool(_views(session, name))
+    with session.waiting(f"module {name}"):
+        return await session.look_for(lambda: bool(_views(session, name)))
 
 
 def _check_network(session: Session) -> None:

@@ -17,7 +17,8 @@ Commands of the bus get a `BusMonitor` instead of a Session (`opening`). Command
 `standalone`, with the option `Via` and `settings()`, or a `service`, such as `run`. What commands need of `config` is
 here, too.
 
-Commands wait here: `Session.settle` for announcements, `Session.waiting` with a report, `patience` for messages,
+Commands wait here: `Session.settle` for announcements, `Session.look_for` for what the user has named before they say
+that it is missing, `Session.waiting` with a report, `patience` for messages,
 `wait_until` for a condition, and `moments` for the time.
 """
 
@@ -26,6 +27,7 @@ import contextlib
 import errno
 import functools
 import inspect
+import math
 import os
 import signal
 import string
@@ -38,6 +40,7 @@ import r2p
 from r2p.clock import random_of
 from r2p.log_lines import printable
 from r2p.startup import INTERRUPTED
+from r2p.tools.announcements import Announcements
 from r2p.tools.config import Settings as Settings
 from r2p.tools.config import UsageError as UsageError
 from r2p.tools.config import settings as settings
@@ -65,12 +68,7 @@ IN_ONE_PROGRAM = ("memory:", "sim:", "rtcan:virtual:")
 
 _DESCRIPTORS = 12  # free file descriptors that are needed: an event loop, its wake-ups, and a link
 _TOO_MANY_FILES = (errno.EMFILE, errno.ENFILE)  # of this process, or of the computer
-_SETTLED = 0.3  # seconds without a new announcement, after which an r2p peer has announced everything
-_SETTLED_ON_BUS = 0.6  # ... on a bus, where modules announce in turn
-_FIRMWARE = 1.5  # seconds in which firmware, which announces one item each half second, is heard at least once
-_SETTLE_MAX = 8.0  # seconds to listen while announcements arrive: a bus of 1 Mbit/s carries 100 of them a second
 _POLL = 0.02  # seconds between two checks of a condition
-_SETTLE_POLL = 0.05  # ... and between two counts of what was announced, which take longer
 _LINK_UP = 5.0  # seconds to wait for the first link
 _GIVE_UP_AFTER = 0.9  # seconds after which a tool ends if it is known of each link why it does not come up
 
@@ -167,6 +165,7 @@ class Session:
 
     def __init__(self, module: r2p.Module, settings: Settings, *, name: str = "tool", verbose: int = 0) -> None:
         self.module = module
+        self.announcements = Announcements(module)
         self.settings = settings
         self.verbose = verbose
         self._name = name
@@ -241,8 +240,8 @@ class Session:
             await asyncio.sleep(wait)
             return
         self.module.query()
-        settled = await self.settled()
-        if self._has_firmware() and (not settled or self._expects_more()):
+        settled = await self.announcements.settled()
+        if self.announcements.have_firmware() and (not settled or self.announcements.expects_more()):
             notify(f"firmware announces one item every 0.5 s, so there may be more {of}: listen longer with --wait 5")
         elif not settled:
             notify(f"announcements kept arriving, so there may be more {of}: listen longer with --wait 20")
@@ -261,7 +260,7 @@ class Session:
                 failed_at = loop.time()
             elif loop.time() - failed_at >= _GIVE_UP_AFTER:
                 raise r2p.TransportError(f"no connection on {self.network_name}")
-            await asyncio.sleep(_SETTLE_POLL)
+            await asyncio.sleep(_POLL)
 
     async def fail_without_key(self) -> None:
         """Raise r2p.TransportError when the other end of each link has refused it for its key; the log says why."""
@@ -270,68 +269,18 @@ class Session:
             await anext(events)
         raise r2p.TransportError(f"no connection on {self.network_name}")
 
-    async def settled(self) -> bool:
-        """Wait until no new announcements arrive; False if they still did after the longest time."""
-        quiet = _SETTLED_ON_BUS if any(link.has_slots for link in self.module.links) else _SETTLED
-        loop = asyncio.get_running_loop()
-        start = changed_at = loop.time()
-        known = 0
-        while (now := loop.time()) - start < _SETTLE_MAX:
-            if now - changed_at > quiet and (  # the second part takes long on a large network
-                now - start > _FIRMWARE or not (self._expects_more() or self._lacks_nodes())
-            ):
-                return True
-            await asyncio.sleep(_SETTLE_POLL)
-            if (count := self._known()) != known:
-                known, changed_at = count, loop.time()
-        return False
+    async def look_for(self, is_known: Callable[[], bool]) -> bool:
+        """Query, and wait until something that the user has named is known; False if it can be said to be missing.
 
-    def _known(self) -> int:
-        known = [link.discovery for link in self.module.links]
-        return sum(len(each.topics) + len(each.endpoints) + len(each.modules) for each in known)
-
-    def _expects_more(self) -> bool:
-        """Return whether a link lacks r2p modules, which would answer at once, or has modules without topics.
-
-        Modules have topics, but a gateway announces those of others only after it has looked for other gateways. And
-        nodes have modules, but may be announced before these.
+        That takes longer than `settled`: on a busy computer a module may answer late, after others or as the first.
         """
-        topics = self.module.network.topics().values()
-        if any(not each.module for view in topics for each in view.publishers + view.subscribers):
-            return True
-        complete = self._links_with_r2p() & self._links_with_topics()
-        return any(link.up and link.name not in complete for link in self.module.links)
-
-    def _lacks_nodes(self) -> bool:
-        """Return whether r2p modules, which announce the nodes of their topics, have only announced a topic so far."""
-        modules = self.module.network.modules()
-        firmware = {view.link for view in modules if view.instance is None}
-        announcing = {view.link for view in modules if view.instance is not None} - firmware
-        for view in self.module.network.topics().values():
-            for known, links in ((view.publishers, view.published_on), (view.subscribers, view.subscribed_on)):
-                if announcing.intersection(links) - {each.link for each in known}:
-                    return True
-        return False
-
-    def _has_firmware(self) -> bool:
-        """Return whether there are announcements of modules that do not answer queries."""
-        modules = self.module.network.modules()
-        return any(view.instance is None for view in modules) or bool(
-            self._links_with_topics() - self._links_with_r2p()
-        )
-
-    def may_have_firmware(self) -> bool:
-        """Return whether firmware has announced something, or may be silent on a link without r2p modules."""
-        firmware = {view.link for view in self.module.network.modules() if view.instance is None}
-        silent = {link.name for link in self.module.links if link.up and link.passes_probes} - self._links_with_r2p()
-        return bool(firmware | silent)
-
-    def _links_with_r2p(self) -> set[str]:
-        return {view.link for view in self.module.network.modules() if view.instance is not None}
-
-    def _links_with_topics(self) -> set[str]:
-        views = self.module.network.topics().values()
-        return {link for view in views for link in view.published_on + view.subscribed_on if link}
+        self.module.query()
+        heard = asyncio.create_task(self.announcements.heard_all())
+        try:
+            await wait_until(lambda: is_known() or heard.done(), math.inf)
+        finally:
+            heard.cancel()
+        return is_known()
 
 
 def alias_or_none(name: str, alias: Callable[[str], str]) -> str | None:

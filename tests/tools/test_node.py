@@ -144,3 +144,12 @@ async def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
         with pytest.raises(r2p.Error, match="nodes found: none"):
             await info(session, "drive")
     assert "no nodes yet on memory:lab" in capsys.readouterr().err
+
+
+async def test_a_module_that_is_late_is_waited_for(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(name="ARM"), tool() as session:
+        showing = asyncio.create_task(info(session, "BOT/log"))
+        await asyncio.sleep(1.0)
+        async with robot():
+            await showing
+    assert printed(capsys)[0]["node"] == "BOT/log"

@@ -212,7 +212,7 @@ async def _check_state(session: Session, loader: LoaderClient, *, reboot: bool) 
         await wait_until(lambda: (found := loader.view()) is None or found.has_loader, _LOADER)
     view = loader.view()
     if view is None:
-        if reboot and session.may_have_firmware():
+        if reboot and session.announcements.may_have_firmware():
             return
         raise TimedOut(unknown_module(session, loader.name))
     if not view.has_loader:

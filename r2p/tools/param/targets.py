@@ -16,9 +16,8 @@ from collections.abc import Iterable
 import r2p
 from r2p.tools.module import unknown_module
 from r2p.tools.output import notify
-from r2p.tools.session import Session, TimedOut, UsageError, wait_until
+from r2p.tools.session import Session, TimedOut, UsageError
 
-_FOUND_WITHIN = 8.0  # seconds in which a module has been announced, through gateways as well
 _ENDED = {
     "boot": "in its boot loader, where its nodes do not run: reboot it, or give --firmware APP",
     "stopped": "stopped: reboot it",
@@ -53,12 +52,7 @@ async def find_modules(session: Session, target: str | None, wait: float | None 
         raise UsageError("no network to look for parameters on: give --via tcp:HOST:PORT or set R2P_VIA")
     await session.settle(wait=wait or 0)
     if wait is None:
-        session.module.query()
-        settled = asyncio.create_task(session.settled())
-        try:
-            await wait_until(lambda: settled.done() or bool(_prefix(session, target)), _FOUND_WITHIN)
-        finally:
-            settled.cancel()
+        await _look_for(session, target)
     names = _prefix(session, target)
     known = _known(session)
     if names and all(known[name].instance is None for name in names):
@@ -76,6 +70,23 @@ async def find_modules(session: Session, target: str | None, wait: float | None 
             "those of rosparam and ros2 param"
         )
     return names or ours
+
+
+async def _look_for(session: Session, target: str | None) -> None:
+    """Wait until the module that a reference begins with is known, or can be said to be missing.
+
+    What has no slash may be a node of any module: of these one has to be known, as soon as the others have settled.
+    """
+    if target is not None and "/" in target:
+        with session.waiting(f"module {target.partition('/')[0]}"):
+            await session.look_for(lambda: bool(_prefix(session, target)))
+        return
+    session.module.query()
+    settled = asyncio.create_task(session.announcements.settled())
+    try:
+        await session.look_for(lambda: bool(_prefix(session, target)) or (settled.done() and bool(_known(session))))
+    finally:
+        settled.cancel()
 
 
 def meant(infos: Infos, target: str) -> Infos:

@@ -69,7 +69,7 @@ async def received_samples(
 
     def report_unadvertised() -> None:
         view = session.module.network.topics().get(topic)
-        if not typed and session.may_have_firmware() and not (view and is_published(view)):
+        if not typed and session.announcements.may_have_firmware() and not (view and is_published(view)):
             notify(f"{topic} has not been advertised: if its firmware announces nothing, give --type")
 
     samples = subscriber.samples()

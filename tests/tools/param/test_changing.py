@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import re
 import tomllib
@@ -88,6 +89,20 @@ async def test_what_is_refused_changes_nothing(words: list[str], error: type[Exc
         with pytest.raises(error, match=text):
             await set_(session, words[0], words[1:])
         assert {name: each.value for name, each in module.parameters.items()} == before
+
+
+@pytest.mark.parametrize(("others", "late"), [(["ARM"], 1.2), ([], 3.0)])
+async def test_a_module_that_is_late_is_waited_for(others: list[str], late: float) -> None:
+    """As on a busy computer: it answers after the others, or is the only one."""
+    async with contextlib.AsyncExitStack() as stack:
+        for name in others:
+            await stack.enter_async_context(robot(turn, name=name))
+        session = await stack.enter_async_context(tool())
+        setting = asyncio.create_task(set_(session, "BOT/drive", ["kp=0.7"]))
+        await asyncio.sleep(late)
+        module = await stack.enter_async_context(robot(drive))
+        await setting
+        assert module.parameters["drive", "kp"].value == 0.7
 
 
 async def test_a_node_that_two_modules_have_must_be_named_with_its_module() -> None:
