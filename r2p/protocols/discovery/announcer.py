@@ -97,6 +97,8 @@ class Announcer:
         self._relayed: dict[tuple[str | int, ...], Relayed] = {}
         self._relayed_names: dict[tuple[str | int, ...], list[_KindName]] = {}
         """The names in relayed endpoints, by the key of each."""
+        self._ended: dict[Item, None] = {}
+        """What has ended while the link was down, so that modules that have not noticed that must be told."""
         self._claimed: set[str] = set()
         """Topics whose names are announced, also while the link does not carry them as another one has the alias."""
         self._long_names: Counter[_KindName] = Counter()
@@ -118,6 +120,7 @@ class Announcer:
         if topic not in self.topics[role]:
             self._add_name(KIND_TOPIC, topic)  # before the topic: an alias is of no use without its name
         self.topics[role][topic] = own
+        self._ended.pop(Item(ItemKind.UNSUBSCRIBE, (topic,), once=True), None)
         self._add(_KIND_OF_ROLE[role], topic)
         return True
 
@@ -127,8 +130,8 @@ class Announcer:
             return False
         self._drop(_KIND_OF_ROLE[role], topic)
         self._drop_name(KIND_TOPIC, topic)
-        if role == ROLE_SUBSCRIBES and self.r2p:  # firmware has no such message: it goes on sending
-            self.announce_once(ItemKind.UNSUBSCRIBE, topic)
+        if role == ROLE_SUBSCRIBES:
+            self._announce_end(ItemKind.UNSUBSCRIBE, topic)
         return True
 
     def add_endpoint(self, node: str, topic: str, role: int, publisher_class: int) -> None:
@@ -138,6 +141,7 @@ class Announcer:
                 self._names.claim(KIND_NODE, node)
                 self._add_name(KIND_NODE, node)
             self._endpoints[key] = publisher_class
+            self._ended.pop(Item(ItemKind.ENDPOINT_GONE, key, once=True), None)
             if self.r2p:
                 self._add(ItemKind.ENDPOINT, *key)
 
@@ -147,8 +151,15 @@ class Announcer:
             self._drop_name(KIND_NODE, node)
             if not any(each == node for each, _, _ in self._endpoints):
                 self._names.release(KIND_NODE, node)
-            if self.r2p:
-                self.announce_once(ItemKind.ENDPOINT_GONE, node, topic, role)
+            self._announce_end(ItemKind.ENDPOINT_GONE, node, topic, role)
+
+    def _announce_end(self, kind: ItemKind, *key: str | int) -> None:
+        """Announce the end of a subscription or endpoint; without a lease, it must be said also after an outage."""
+        item = Item(kind, key, once=True)
+        if self.outbox.up and (self.r2p or self._directory.has_addresses):  # firmware has no such message
+            self._schedule.add(item)
+        elif self._directory.has_addresses:
+            self._ended[item] = None
 
     # When to announce it
 
@@ -180,6 +191,14 @@ class Announcer:
         if item.kind is ItemKind.PUBLISHER or item.key[0] in self.publisher_counts:
             return True
         return info is None or info.advertised_at is None
+
+    def set_lossless(self, *, lossless: bool) -> None:
+        """Repeat as little as is possible where nothing is lost. Begin with a HELLO, which may have been lost before,
+        and is rare from now on.
+        """
+        if self._schedule.set_lossless(lossless=lossless):
+            self._hello_in = 0
+            self.announce_once(ItemKind.PRESENCE)
 
     def repeat_all(self, now: int, *, tool: bool) -> None:
         """Repeat everything soon, as a module on the link is new, or asks for it; `tool`: it shows all to a user."""
@@ -225,6 +244,10 @@ class Announcer:
         if self.r2p == r2p:
             return
         self.r2p = r2p
+        if r2p:
+            for item in self._ended:
+                self._schedule.add(item)
+            self._ended.clear()
         for key in self._endpoints:
             if r2p:
                 self._add(ItemKind.ENDPOINT, *key)

@@ -162,6 +162,13 @@ class Directory:
         lease = max(self._leases.get(source, ()), default=NEVER)
         return lease if lease < NEVER else None
 
+    def lease_end(self, now: int, source: PeerAddress, lease: int) -> int:
+        """Return when a topic of an r2p module at this address is over if it is not repeated (ns).
+
+        Where nothing is lost, the module says so itself, and has its own lease: NEVER.
+        """
+        return NEVER if self.has_addresses and source in self._direct else now + lease
+
     def is_alone(self, source: PeerAddress, instance: int) -> bool:
         """Return whether no other module than this one is known directly at an address."""
         return all(info.instance == instance for info in self._direct.get(source, {}).values())
@@ -216,7 +223,10 @@ class Directory:
         self._forget_direct(forgotten)
         self._enter_direct(info)
         if info.instance is not None:
+            is_new = info.instance not in self._names
             self._names[info.instance] = info.name
+            for key in self._endpoints_of.get(info.instance, ()) if is_new else ():  # they came before its HELLO
+                self._start_lease(info.last_heard, key, info)
         if forgotten is not None:
             self._forget(forgotten)
         return forgotten
@@ -517,7 +527,7 @@ class LeasedDemand(Demand):
             self._directory.counts["topics not forwarded"] += 1
             return
         if lease is not None:
-            self._timers.set(("demand", topic, role, source), now + lease)
+            self._set_timer(now, topic, role, source, lease)
             self._permanent.get(source, {}).pop((topic, role), None)
         elif ("demand", topic, role, source) not in self._timers:
             self._permanent.setdefault(source, {})[topic, role] = None
@@ -534,4 +544,22 @@ class LeasedDemand(Demand):
         lease = self._directory.lease_of(source) if source in self._permanent else None
         if lease is not None:
             for topic, role in self._permanent.pop(source):
-                self._timers.set(("demand", topic, role, source), now + lease)
+                self._set_timer(now, topic, role, source, lease)
+
+    def start_leases(self, now: int) -> None:
+        """Let all entries of r2p modules end that are not repeated, as something may be lost from now on."""
+        for topic, role in self._sources:
+            for source in self.sources_of(topic, role):
+                if ("demand", topic, role, source) in self._timers:
+                    self._set_timer(now, topic, role, source, self._directory.lease_of(source) or LEASE)
+
+    def module_gone(self, source: PeerAddress) -> None:
+        """End what has no lease, at an address where no r2p module is left."""
+        if not self._directory.has_addresses:
+            return
+        for topic, role in self.entries_of(source):
+            if ("demand", topic, role, source) in self._timers:
+                self.expired(topic, role, source)
+
+    def _set_timer(self, now: int, topic: str, role: int, source: PeerAddress, lease: int) -> None:
+        self._timers.set(("demand", topic, role, source), self._directory.lease_end(now, source, lease))

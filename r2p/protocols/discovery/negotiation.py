@@ -17,7 +17,7 @@ import msgspec
 from r2p.codecs import management
 from r2p.codecs.management import ANSWERED, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic
-from r2p.protocols.discovery.directory import LEASE, Directory, counterpart, decrement, topic_lease
+from r2p.protocols.discovery.directory import LEASE, Directory, LeasedDemand, counterpart, decrement, topic_lease
 from r2p.protocols.discovery.events import (
     Mismatched,
     ModuleInfo,
@@ -108,6 +108,8 @@ class SubscriptionNegotiation:
         self._requests = SharedAnswers[management.SubscribeRequest](directory, ROLE_SUBSCRIBES)
         self._attached: set[str] = set()
         """Topics with a `SubscriberJoined`, and no `SubscribersGone` since."""
+        self.demand: LeasedDemand | None = None
+        """What gateways track, whose leases begin and end with those here."""
 
     # Messages
 
@@ -301,6 +303,21 @@ class SubscriptionNegotiation:
         if peer is not None:
             peer.mark_restarted()
 
+    def set_lossless(self, now: int, *, lossless: bool, has_addresses: bool) -> None:
+        """Note the same as `Directory.set_lossless`; subscriptions get leases once something may be lost."""
+        had_addresses = self._directory.has_addresses
+        self._directory.set_lossless(now, lossless=lossless, has_addresses=has_addresses)
+        if had_addresses and not has_addresses:
+            self._start_leases(now)
+
+    def _start_leases(self, now: int) -> None:
+        for peer in self._peers.values():
+            if peer.is_r2p(now):
+                for topic in peer.subscriptions:
+                    self._renew(now, peer, topic)
+        if self.demand is not None:
+            self.demand.start_leases(now)
+
     def module_gone(self, now: int, info: ModuleInfo) -> None:
         """Note that a module left its address. With the last r2p module there, all subscriptions and publishers end."""
         peer = self._peers.get(info.source)
@@ -351,6 +368,8 @@ class SubscriptionNegotiation:
             self._prune(peer)
 
     def _forget_peer(self, now: int, peer: Peer) -> None:
+        if self.demand is not None:
+            self.demand.module_gone(peer.source)
         self._offers.remove(peer.source)
         self._requests.remove(peer.source)
         for topic in list(peer.subscriptions):
@@ -432,7 +451,7 @@ class SubscriptionNegotiation:
             return
         peer.permanent.discard(topic)
         if peer.lease is not None:  # else the end of its module ends it
-            self._timers.set(key, now + peer.lease)
+            self._timers.set(key, self._directory.lease_end(now, peer.source, peer.lease))
 
     def _end(self, peer: Peer, topic: str, role: int) -> None:
         """End the flow to or from a peer in this role."""

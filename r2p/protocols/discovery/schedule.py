@@ -148,11 +148,16 @@ class Schedule:
         self._bucket = self._bucket.changed(rate, max(burst, _ITEM_MESSAGES))
         self._quiet = quiet
 
-    def set_lossless(self, *, lossless: bool) -> None:
-        """Set whether everything sent arrives and newcomers are answered one by one. If so, less is repeated."""
-        if self._lossless and not lossless:
-            self._hurry()
+    def set_lossless(self, *, lossless: bool) -> bool:
+        """Set whether everything sent arrives and newcomers are answered one by one; return whether that is a change.
+
+        Everything is announced anew: leases that were short are long from now on, and those that had no end have one.
+        """
+        if self._lossless == lossless:
+            return False
         self._lossless = lossless
+        self._hurry()
+        return True
 
     @property
     def _turns(self) -> int:

@@ -378,7 +378,7 @@ class Discovery(DiscoveryProtocol):
     def demand(self) -> Demand:
         """Return what the other modules publish and subscribe to, which is tracked from the first call on."""
         if self._demand is None:
-            self._demand = LeasedDemand(self._directory)
+            self._demand = self._negotiation.demand = LeasedDemand(self._directory)
         return self._demand
 
     # Names
@@ -486,8 +486,8 @@ class Discovery(DiscoveryProtocol):
 
     def set_lossless(self, now: int, *, lossless: bool = True, addresses: bool = False) -> list[Event]:
         has_addresses = lossless and addresses
-        self._directory.set_lossless(now, lossless=lossless, has_addresses=has_addresses)
-        self._schedule.set_lossless(lossless=has_addresses)
+        self._negotiation.set_lossless(now, lossless=lossless, has_addresses=has_addresses)
+        self._announcer.set_lossless(lossless=has_addresses)
         self._announcer.update_r2p()
         return self._flush(now)
 

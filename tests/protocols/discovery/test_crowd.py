@@ -157,6 +157,57 @@ def test_where_nothing_is_lost_one_other_module_is_enough() -> None:
     assert offers(discovery, 52 * S, 57 * S) >= 3
 
 
+def test_where_nothing_is_lost_a_subscription_ends_with_its_module_only() -> None:
+    """However many modules come, and however late it is repeated for that; a gateway's demand ends the same way."""
+    discovery = Discovery("PC1", 99)
+    discovery.set_lossless(0, addresses=True)
+    demand = discovery.demand()
+    discovery.advertise(0, "leds", 5)
+    discovery.link_up(0)
+    hear(discovery, 0, m.Hello("M1", 1, wire=m.WIRE_VERSION), m.SubscribeRequest("leds", 5, 5), source=1)
+    gone: list[int] = []
+
+    def pass_time(start: int, end: int, *, alive: bool = True) -> bool:
+        for second in range(start, end):
+            gone.extend(
+                at for at, each in run(discovery, second * S, second * S + S) if each == SubscribersGone("leds")
+            )
+            if alive:
+                hear(discovery, second * S + S, m.Hello("M1", 1, wire=m.WIRE_VERSION), source=1)
+        return demand.is_subscribed("leds") and not gone
+
+    assert pass_time(0, 300)
+    discovery.set_lossless(300 * S, lossless=False)
+    assert not pass_time(300, 400)
+    assert len(gone) == 1
+    discovery.set_lossless(400 * S, addresses=True)
+    hear(discovery, 400 * S, m.SubscribeRequest("leds", 5, 5), source=1)
+    gone.clear()
+    assert pass_time(400, 500)
+    assert not pass_time(500, 506, alive=False)
+    assert len(gone) == 1
+
+
+def test_an_endpoint_that_came_before_its_module_stays_where_nothing_is_lost() -> None:
+    """The HELLO of before was lost, as there were faults."""
+    discovery = Discovery("PC1", 99)
+    discovery.set_lossless(0, addresses=True)
+    discovery.link_up(0)
+    hear(discovery, 0, m.Endpoint(m.ROLE_PUBLISHES, 1, "drive", "leds", 1), source=1)
+    for second in range(1, 20):
+        hear(discovery, second * S, m.Hello("M1", 1, wire=m.WIRE_VERSION), source=1)
+        run(discovery, second * S, second * S + S)
+    assert len(discovery.endpoints) == 1
+
+
+def test_a_hello_comes_first_when_nothing_is_lost_any_more() -> None:
+    discovery = crowded()
+    run(discovery, 0, 10 * S)
+    said = sent(discovery.set_lossless(10 * S, addresses=True))
+    assert isinstance(said[0], m.Hello)
+    assert any(isinstance(each, m.Advertise) for each in said)
+
+
 def crowded(*, wire: int = m.WIRE_VERSION) -> Discovery:
     """One that knows five others on its link, and repeats a topic."""
     discovery = Discovery("PC1", 99)
