@@ -114,5 +114,5 @@ def fuse(path: str) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    for name, error in fuse(sys.argv[1]).items():
+    for name, error in fuse(*sys.argv[1:2] or sys.exit(__doc__)).items():
         print(f"{name:24} {error:6.3f} m")

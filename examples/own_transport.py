@@ -56,5 +56,5 @@ async def hello(node: r2p.Node) -> None:
 
 
 if __name__ == "__main__":
-    here, there = map(int, sys.argv[1:3])
+    here, there = map(int, sys.argv[1:3] or sys.exit(__doc__))
     r2p.run(hello, module=f"UDP{here % 1000}", via=Udp(here, there))

@@ -22,6 +22,7 @@ from r2p.errors import Error, NameTooLong
 from r2p.messages.definition import explain_arguments
 from r2p.modules.unwinding import cleans_up, ends
 from r2p.names import NODE_MAX, node_name
+from r2p.parameters.sources import GivenValueError
 from r2p.runtime.node import Node
 
 NodeFunction = Callable[..., Awaitable[object]]
@@ -196,6 +197,12 @@ class Supervisor:
         self.node.close()  # again: a task that is cancelled before its first step does not get to it
         ended(self)
 
+    def _log_error(self, error: Exception) -> None:
+        if isinstance(error, GivenValueError):  # no mistake of the program, whose traceback would not help
+            self.node.log.error("node %s can't start: %s", self.node.name, error)
+            return
+        self.node.log.error("node %s crashed: %s: %s", self.node.name, type(error).__name__, error, exc_info=error)
+
     async def _run(self) -> None:
         self._begun = True
         loop = asyncio.get_running_loop()
@@ -206,7 +213,7 @@ class Supervisor:
             if error is None:
                 return
             explain_arguments(error)
-            self.node.log.error("node %s crashed: %s: %s", self.node.name, type(error).__name__, error, exc_info=error)
+            self._log_error(error)
             if self._stopping or self.on_trial or not self.options.restart:
                 error.add_note(f"in node {self.node.name} of module {self.node.module}")
                 self.error = error

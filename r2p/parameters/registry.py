@@ -15,7 +15,7 @@ from r2p.errors import Closed, ParameterError
 from r2p.parameters.definition import ParameterDefinition, ParameterInfo
 from r2p.parameters.file import ParameterFile
 from r2p.parameters.parameter import Parameter, ParameterOwner
-from r2p.parameters.sources import ParameterSource
+from r2p.parameters.sources import GivenValueError, ParameterSource
 from r2p.parameters.values import plain
 
 T = TypeVar("T")
@@ -354,7 +354,7 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
         try:
             return definition.parse(cast("str", value)) if source.texts else definition.convert(value)
         except ParameterError as error:
-            raise ParameterError(f"{error} (from {source.label})") from None
+            raise GivenValueError(f"{error} (from {source.label})") from None
 
 
 def _misfit(error: ParameterError) -> str:

@@ -18,6 +18,10 @@ TABLE = "params"
 """The table of files: `[params.MODULE.node]`."""
 
 
+class GivenValueError(ParameterError):
+    """A value given at the start that a parameter refuses: whoever gave it has to change it, not the program."""
+
+
 class ParameterSource(msgspec.Struct, eq=False):
     """Values that were given at the start of a module: by a file, by options, or by the program that made it.
 

@@ -415,4 +415,5 @@ def test_options_reach_the_nodes_and_a_value_that_does_not_fit_is_an_error_of_it
         *("--param", "speed.kp=7", "--param", "arm.kp=fast", "--params-file", "saved.toml"),
     )
     assert (code, out) == (1, "7.0 3\n")
-    assert "PC1/arm.kp = 'fast': it takes an int (from --param)" in err
+    assert "node arm can't start: PC1/arm.kp = 'fast': it takes an int (from --param)" in err
+    assert "Traceback" not in err  # no mistake of the program
