@@ -152,3 +152,24 @@ async def test_a_long_name_of_two_modules_is_known_when_one_of_them_has_ended_it
         views = a.network.topics()
         assert [each.node for each in views["more"].publishers] == [LONG_NODE]
         assert views["leds"].publishers == []
+
+
+async def test_a_type_ends_with_its_last_publisher() -> None:
+    """What comes next says its type once, and soon: the one of before is not still believed for its lease."""
+    network = Network()
+    async with network.module("A", observer=True) as a, network.module("B") as b:
+        for message in (Led, Float32):
+            async with node_in(b) as node:
+                node.advertise("a/topic/of/a/long/name", message)
+                await asyncio.sleep(0.1)
+                assert a.network.topics()["a/topic/of/a/long/name"].fingerprint == layout(message).fingerprint
+
+
+async def test_a_subscriber_of_another_type_does_not_hide_that_of_the_publisher() -> None:
+    network = Network()
+    async with network.module("A", observer=True) as a, network.node("B") as b, network.node("C") as c:
+        b.advertise("leds", Led)
+        await asyncio.sleep(8)
+        c.subscribe("leds", Float32)
+        await asyncio.sleep(0.1)
+        assert a.network.topics()["leds"].fingerprint == layout(Led).fingerprint

@@ -128,6 +128,7 @@ class Directory:
         self._leases: dict[PeerAddress, Counter[int]] = {}
         self._names: dict[int, str] = {}
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
+        self._ends: Counter[_TopicRole] = Counter()  # endpoints of each topic and role
         self._starts: dict[str, _Starts] = {}
         self._emit = emit
         self._said_full = False
@@ -273,8 +274,9 @@ class Directory:
         info = self.touch_topic(topic)
         if info.typed_at and now > min(info.typed_at.values()) + LEASE:
             for each in [each for each, at in info.typed_at.items() if now > at + LEASE]:
-                del info.typed_at[each]
-                info.set_type(each, None)
+                if each == role or not self.has_addresses:  # what is said once lasts until another one is said
+                    del info.typed_at[each]
+                    info.set_type(each, None)
         known = info.types.get(role, _UNKNOWN)
         if said == known and role in info.typed_at:  # as almost always
             info.typed_at[role] = now
@@ -302,6 +304,7 @@ class Directory:
     def _keep_endpoint(self, now: int, info: EndpointInfo) -> None:
         key = (info.instance, info.node, info.topic, info.role)
         self.generation += self.endpoints.get(key) != info
+        self._ends[info.topic, info.role] += key not in self.endpoints
         old = self._put(self.endpoints, key, info, "endpoints forgotten")
         self._endpoints_of.setdefault(info.instance, {})[key] = None
         if old is not None:
@@ -334,8 +337,8 @@ class Directory:
         field = "topic" if kind == management.KIND_TOPIC else "node"
         for key, endpoint in list(self.endpoints.items()):
             if getattr(endpoint, field) == old:
-                self.forget_endpoint(key)
                 self._keep_endpoint(now, msgspec.structs.replace(endpoint, **{field: new}))
+                self.forget_endpoint(key)
 
     def forget_endpoint(self, key: EndpointKey) -> None:
         if self.endpoints.pop(key, None) is not None:
@@ -345,10 +348,14 @@ class Directory:
     def _drop_endpoint(self, key: EndpointKey) -> None:
         """Forget everything of an endpoint that has left the table."""
         self.timers.clear(("endpoint", key))
-        keys = self._endpoints_of[key[0]]
+        instance, _, topic, role = key
+        if decrement(self._ends, (topic, role)) and self.has_addresses and (info := self.topics.get(topic)):
+            info.typed_at.pop(role, None)  # the next type is said once, too
+            info.set_type(role, None)
+        keys = self._endpoints_of[instance]
         del keys[key]
         if not keys:
-            del self._endpoints_of[key[0]]
+            del self._endpoints_of[instance]
 
     def _put(self, table: dict[K, V], key: K, value: V, reason: str) -> V | None:
         """Enter a value as the latest one; return the one that was forgotten for it. A dict keeps the order."""
