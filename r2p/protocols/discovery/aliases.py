@@ -287,8 +287,7 @@ class LinkNames:
         own, ours = self._own.get(key), self.alias(kind, name)
         if own == name:
             if name != alias and not chosen and key not in self._learnt:  # it is also theirs, once this module ends it
-                self._learnt[key] = name
-                _bound(self._learnt, self.most, self.counts)
+                self._learn(now, key, name)
             return ""
         if own == alias:  # a short name of this module's own stays what it is
             self._contest(now, key, own, name)

@@ -14,7 +14,7 @@ from r2p.names import chosen_alias, module_alias, module_path, node_alias, topic
 from r2p.protocols.discovery.aliases import ModuleAliases
 from r2p.protocols.discovery.events import AliasConflict, AliasesDiffer, AliasFreed, Event, PublisherFound
 from r2p.protocols.discovery.session import Discovery
-from tests.protocols.discovery.wire import ME, ONE, PC2, PEER, S, changes_in, hear, run, sent
+from tests.protocols.discovery.wire import ME, ONE, PC2, PEER, S, changes_in, hear, run, sent, started
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -359,3 +359,13 @@ def test_services_of_a_chosen_alias() -> None:
     aliases = {"front_left/calibrate": "fl_cal"}
     discovery, _ = module_with("front_left/calibrate_q", aliases=aliases)
     assert offered(discovery) == ["fl_cal_q"] == [chosen_alias("front_left/calibrate_q", aliases)]
+
+
+def test_what_came_under_an_alias_gets_the_name_also_if_this_module_has_taken_it_meanwhile() -> None:
+    discovery = started()
+    name = "arm/left/joint_states"
+    alias = discovery.alias(name)
+    hear(discovery, S, m.Hello("PC2", 2), m.Endpoint(m.ROLE_PUBLISHES, 2, "drive", alias, 1))
+    discovery.claim(name)
+    hear(discovery, S, *m.long_name_messages(m.KIND_TOPIC, name), m.Endpoint(m.ROLE_PUBLISHES, 2, "drive", alias, 1))
+    assert [each.topic for each in discovery.endpoints.values()] == [name]
