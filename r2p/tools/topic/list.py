@@ -49,6 +49,9 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
     """
     output = Output(format)
     await session.settle(wait)
+    if wait is None and session.settings.via and not session.module.network.topics():  # all others may be busy
+        await session.look_for(lambda: bool(session.module.network.topics()))
+        await session.announcements.settled()
     views, name = session.module.network.topics(), topic_name(topic)
     collisions = _collisions(session, name)
     view = views.get(name) or _with_alias(session, name, views.values())

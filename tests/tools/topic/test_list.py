@@ -230,6 +230,16 @@ async def test_info_of_a_topic_that_nobody_knows() -> None:
 
 
 @pytest.mark.virtual_time
+async def test_info_waits_for_the_only_module_if_that_is_late(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        showing = asyncio.create_task(info(session, "log"))
+        await asyncio.sleep(3.0)
+        async with robot():
+            await showing
+    assert printed(capsys)[0]["topic"] == "log"
+
+
+@pytest.mark.virtual_time
 async def test_info_tells_of_different_types(capsys: pytest.CaptureFixture[str]) -> None:
     async def other(node: r2p.Node) -> None:
         node.subscribe("leds", Velocity3)
