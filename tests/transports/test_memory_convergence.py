@@ -5,17 +5,16 @@ from __future__ import annotations
 import asyncio
 import random
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
+import r2p
+from r2p.keys import SharedKey
 from r2p.messages import layout
 from r2p.msg import Float32, Led, Text
 from r2p.testing.network import Network, node_in
-from r2p.transports.memory import MemoryLink
-
-if TYPE_CHECKING:
-    import r2p
+from r2p.transports.memory import MemoryLink, MemoryNetwork, MemoryTransport
 
 pytestmark = pytest.mark.virtual_time
 
@@ -118,22 +117,25 @@ async def test_all_know_what_there_is(seed: int) -> None:
         await stack.aclose()
 
 
-async def test_what_ends_while_a_link_is_down_is_said_when_it_is_up() -> None:
-    network = Network()
+@pytest.mark.parametrize("key", [None, SharedKey(bytes(32))], ids=["without a key", "with a key"])
+async def test_what_ends_while_a_link_is_down_is_said_when_it_is_up(key: SharedKey | None) -> None:
+    network = MemoryNetwork()
     async with (
-        network.module("A") as a,
-        network.module("B") as b,
+        r2p.Module("A", via=MemoryTransport("lab", network, key=key)) as a,
+        r2p.Module("B", via=MemoryTransport("lab", network, key=key)) as b,
         node_in(a) as here,
         node_in(b) as there,
     ):
         publisher = there.advertise("leds", Led)
         subscriber, ended = here.subscribe("leds", Led), here.advertise("other", Led)
         await asyncio.sleep(1)
-        network.disconnect(a)
+        (link,) = a.links
+        assert isinstance(link, MemoryLink)
+        link.disconnect()
         subscriber.close()
         ended.close()
-        network.connect(a)
-        await asyncio.sleep(0.1)
+        link.connect()
+        await asyncio.sleep(1)
         assert publisher.subscribers == 0
         assert [b.network.topics()[name].subscribers for name in ("leds", "other")] == [[], []]
         assert b.network.topics()["other"].publishers == []

@@ -158,7 +158,7 @@ class Announcer:
         item = Item(kind, key, once=True)
         if self.outbox.up and (self.r2p or self._directory.has_addresses):  # firmware has no such message
             self._schedule.add(item)
-        elif self._directory.has_addresses:
+        elif self._directory.is_lossless:
             self._ended[item] = None
 
     # When to announce it
