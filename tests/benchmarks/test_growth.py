@@ -12,6 +12,7 @@ from benchmarks.growth import draw, router_mesh, zenoh_network
 from benchmarks.growth.curve import Curve, exponent
 from benchmarks.growth.router_mesh import Sent
 from r2p.codecs import liveliness, management
+from r2p.protocols.discovery.events import QueryTokens
 from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.liveliness.session import LivelinessDiscovery
 
@@ -96,13 +97,17 @@ def announcements(number: int) -> tuple[management.Management, ...]:
 
 
 def test_time_at_rest_is_nothing() -> None:
-    """Nothing is due in a network where nothing changes, however large it is."""
+    """Nothing is due in a network where nothing changes, however large it is, once all tokens have been queried."""
     joins = LivelinessDiscovery("JOINS", 0xFFFF)
     joins.link_up(0)
     joins.poll(0)
     for key in zenoh_network.keys(20):
         joins.appeared(0, liveliness.token_of(key.removeprefix("live/")))
     assert len(joins.topics) == 200
+    queried = joins.next_deadline()
+    assert queried is not None
+    assert QueryTokens() in joins.poll(queried)
+    joins.query_ended(queried, complete=True)
     assert joins.next_deadline() is None
 
 

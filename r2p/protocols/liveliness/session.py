@@ -172,6 +172,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def link_up(self, now: int) -> list[Event]:
         self._outbox.up = True
         self._outbox.emit(*self._own.pop_changes())
+        self._refused.note_joined()
         self._review_refused(now)
         return self._outbox.drain()
 
@@ -341,11 +342,11 @@ class LivelinessDiscovery(DiscoveryProtocol):
 class RefusedTokens:
     """Counts tokens that were refused as there were too many, and says when to query them.
 
-    The network reports each token only once, so refused ones have to be queried when there is room. They are not kept,
-    only counted: memory stays bounded. Many answers are work for a router, so this waits until all of them have room,
-    or a quarter of the table is free, and longer and longer where that happens again and again. It ends with a query
-    that brings nothing new: under load, one in some thousand ends before its last answers. While the network has more
-    tokens than fit, some stay unknown.
+    The network reports each token only once, if at all while many sessions join, so all are queried after that, and
+    refused ones when there is room. They are not kept, only counted: memory stays bounded. Many answers are work for a
+    router, so this waits until all of them have room, or a quarter of the table is free, and longer and longer where
+    that happens again and again. It ends with a query that brings nothing new: under load, one in some thousand ends
+    before its last answers. While the network has more tokens than fit, some stay unknown.
     """
 
     def __init__(self, most: int, spread: int) -> None:
@@ -372,6 +373,10 @@ class RefusedTokens:
     def remove_one(self) -> None:
         """Note the end of a token that was not kept."""
         self._count = max(0, self._count - 1)
+
+    def note_joined(self) -> None:
+        """Have all tokens queried once, later: zenoh 1.10 loses some reports where many sessions join together."""
+        self._any = True
 
     def note_found(self) -> None:
         """Note that a token has got a place: if an answer brought it, another one may be missing among the answers."""

@@ -178,9 +178,23 @@ def test_nothing_is_asked_of_a_network_that_is_away(network: Network) -> None:
     network.remove(KEYS[0])
     network.module.link_down(network.now)
     assert network.module.next_deadline() is None
-    network.module.link_up(network.now)
     network.wait(3600.0)
     assert not network.looks
+
+
+def test_what_is_not_reported_while_a_module_joins_is_found_soon(network: Network) -> None:
+    """zenoh may lose tokens then."""
+    network.keys += KEYS[:3]
+    network.unsaid = {KEYS[0]}
+    network.wait(10.0)
+    assert list(network.module.modules) == ["M2", "M3"]
+    network.wait(3600.0)
+    assert set(network.module.modules) == {"M1", "M2", "M3"}
+    assert len(network.looks) == 3  # the last one brought nothing
+    network.module.link_down(network.now)
+    network.module.link_up(network.now)
+    network.wait(10.0)
+    assert len(network.looks) == 4
 
 
 def test_a_token_that_is_refused_twice_in_a_look_does_not_need_room_for_two() -> None:
