@@ -375,7 +375,7 @@ class RefusedTokens:
         self._count = max(0, self._count - 1)
 
     def note_joined(self) -> None:
-        """Have all tokens queried once, later: zenoh 1.10 loses some reports where many sessions join together."""
+        """Have all tokens queried once, later: some reports are missing where many sessions join together."""
         self._any = True
 
     def note_found(self) -> None:

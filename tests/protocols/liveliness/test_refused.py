@@ -183,7 +183,7 @@ def test_nothing_is_asked_of_a_network_that_is_away(network: Network) -> None:
 
 
 def test_what_is_not_reported_while_a_module_joins_is_found_soon(network: Network) -> None:
-    """zenoh may lose tokens then."""
+    """Some reports are missing where many modules join at the same time."""
     network.keys += KEYS[:3]
     network.unsaid = {KEYS[0]}
     network.wait(10.0)
