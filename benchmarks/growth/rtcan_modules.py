@@ -14,7 +14,7 @@ from r2p import sim
 from r2p.msg import Led
 from r2p.transports.rtcan.link import RtcanLink
 
-SIZES = (5, 10, 20, 30)
+SIZES = (5, 10, 20)
 TOPICS, SUBSCRIBED = 10, (1, 7)
 """Topics of each module, and the modules after it of which it subscribes to the topic that has slots."""
 PERIOD = 0.04  # s
