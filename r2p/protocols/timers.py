@@ -24,7 +24,7 @@ class KeyedTimers:
         return key in self._due
 
     def set(self, key: Hashable, due: int) -> None:
-        """Let a key expire at `due` (ns), earlier or later than before."""
+        """Let a key expire at `due` (ns), earlier or later than before; NEVER: it stays until it is cleared."""
         before = self._due.get(key)
         self._due[key] = due
         if before is None or due < before:
@@ -66,8 +66,10 @@ class KeyedTimers:
         self.due = NEVER
 
     def _push(self, key: Hashable, due: int) -> None:
+        if due >= NEVER:
+            return
         if len(self._heap) > 2 * len(self._due) + 64:  # keys that come and go: their old places would pile up
-            self._heap = [(at, n, each) for n, (each, at) in enumerate(self._due.items())]
+            self._heap = [(at, n, each) for n, (each, at) in enumerate(self._due.items()) if at < NEVER]
             heapq.heapify(self._heap)
             self._pushed = len(self._heap)
             return
