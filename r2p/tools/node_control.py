@@ -193,9 +193,7 @@ def _line(topic: r2p.TopicPause) -> str:
     if topic.period is None:
         return text
     missed = max(0, round(topic.pause / topic.period) - 1)
-    return (
-        f"{text}, {f'{missed} periods of' if missed else 'the period is'} {_ms(topic.period)}{' missed' * bool(missed)}"
-    )
+    return f"{text}, {missed or 'no'} period{'s' * (missed > 1)} of {_ms(topic.period)} missed"
 
 
 def _ms(seconds: float) -> str:

@@ -155,7 +155,7 @@ async def test_the_pause_as_people_read_it(directory: Path, monkeypatch: pytest.
         await node_control.swap(session, "BOT", "blink", "robot_nodes.py:blink=right")
     assert terminal.getvalue().splitlines() == [
         "BOT: node right runs robot_nodes.py:blink",
-        "  leds: pause of 20 ms, the period is 20 ms",
+        "  leds: pause of 20 ms, no period of 20 ms missed",
         "  events: nothing published yet",
     ]
 
