@@ -97,8 +97,10 @@ class Announcer:
         self._relayed: dict[tuple[str | int, ...], Relayed] = {}
         self._relayed_names: dict[tuple[str | int, ...], list[_KindName]] = {}
         """The names in relayed endpoints, by the key of each."""
+        self._said: set[tuple[str | int, ...]] = set()
+        """Subscriptions and endpoints that modules knew when the link went down, by their keys."""
         self._ended: dict[Item, None] = {}
-        """What has ended while the link was down, so that modules that have not noticed that must be told."""
+        """Those of them that have ended since, which the modules must be told."""
         self._claimed: set[str] = set()
         """Topics whose names are announced, also while the link does not carry them as another one has the alias."""
         self._long_names: Counter[_KindName] = Counter()
@@ -158,7 +160,7 @@ class Announcer:
         item = Item(kind, key, once=True)
         if self.outbox.up and (self.r2p or self._directory.has_addresses):  # firmware has no such message
             self._schedule.add(item)
-        elif self._directory.is_lossless:
+        elif self._directory.is_lossless and key in self._said:
             self._ended[item] = None
 
     # When to announce it
@@ -248,6 +250,7 @@ class Announcer:
             for item in self._ended:
                 self._schedule.add(item)
             self._ended.clear()
+            self._said.clear()
         for key in self._endpoints:
             if r2p:
                 self._add(ItemKind.ENDPOINT, *key)
@@ -304,6 +307,8 @@ class Announcer:
 
     def link_down(self) -> None:
         """Stop, until the link is up again."""
+        if self.r2p:
+            self._said = {*((topic,) for topic in self.topics[ROLE_SUBSCRIBES]), *self._endpoints}
         self._answers.clear()
         self._schedule.stop()
 

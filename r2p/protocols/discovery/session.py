@@ -338,7 +338,6 @@ class Discovery(DiscoveryProtocol):
         )
         self._negotiation = SubscriptionNegotiation(self._announcer, self._directory)
         self._liveness = PeerLiveness(self._announcer, self._negotiation, self._directory)
-        self._demand: LeasedDemand | None = None
         self._handlers: dict[type, Callable[[int, Any, PeerAddress], None]] = {
             management.Alive: self._liveness.alive,
             management.Stop: self._commanded,
@@ -377,9 +376,9 @@ class Discovery(DiscoveryProtocol):
 
     def demand(self) -> Demand:
         """Return what the other modules publish and subscribe to, which is tracked from the first call on."""
-        if self._demand is None:
-            self._demand = self._negotiation.demand = LeasedDemand(self._directory)
-        return self._demand
+        if self._negotiation.demand is None:
+            self._negotiation.demand = LeasedDemand(self._directory)
+        return self._negotiation.demand
 
     # Names
 
@@ -425,8 +424,8 @@ class Discovery(DiscoveryProtocol):
             self._announcer.announce_name(KIND_TOPIC, short)
         for change in self._names.pop_renames():
             self._directory.rename(now, change.kind, change.old, change.new)
-            if self._demand is not None and change.kind == KIND_TOPIC:
-                self._demand.rename(now, change.old, change.new)
+            if self._negotiation.demand is not None and change.kind == KIND_TOPIC:
+                self._negotiation.demand.rename(now, change.old, change.new)
 
     # What this module has
 
@@ -439,9 +438,9 @@ class Discovery(DiscoveryProtocol):
     def _set_topic(self, now: int, topic: str, role: int, own: LocalTopic) -> list[Event]:
         if self._announcer.set_topic(topic, role, own):
             self._negotiation.type_changed(topic, counterpart(role))
-            if role == ROLE_PUBLISHES and self._demand is not None:
+            if role == ROLE_PUBLISHES and self._negotiation.demand is not None:
                 # Earlier requests, before there was a publisher, need not be repeated.
-                for source in self._demand.sources_of(topic, ROLE_SUBSCRIBES):
+                for source in self._negotiation.demand.sources_of(topic, ROLE_SUBSCRIBES):
                     self._negotiation.requested(now, management.SubscribeRequest(topic, own.type.size_field, 1), source)
         return self._flush(now)
 
@@ -507,8 +506,8 @@ class Discovery(DiscoveryProtocol):
         self._announcer.link_down()
         self._liveness.link_down(now)  # first: negotiation then drops what modules leave behind for a while
         self._negotiation.link_down()
-        if self._demand is not None:
-            self._demand.link_down()
+        if self._negotiation.demand is not None:
+            self._negotiation.demand.link_down()
         return self._outbox.drain()
 
     def leave(self, now: int) -> list[Event]:
@@ -545,7 +544,7 @@ class Discovery(DiscoveryProtocol):
             self.counts["link down"] += len(messages)
             return []
         self._schedule.traffic(now)
-        handlers, demand = self._handlers, self._demand
+        handlers, demand = self._handlers, self._negotiation.demand
         for message in map(self._names.from_wire, messages) if self._names.has_aliases else messages:
             handlers[type(message)](now, message, source)
             if demand is not None:
@@ -566,8 +565,8 @@ class Discovery(DiscoveryProtocol):
         if handler is not None and not self._liveness.drop_echo(now, data):
             message = self._names.from_wire(message)
             handler(now, message, source)  # before demand, which looks up the leases that a HELLO has set
-            if self._demand is not None:
-                self._demand.receive(now, message, source)
+            if self._negotiation.demand is not None:
+                self._negotiation.demand.receive(now, message, source)
         return self._outbox.drain()
 
     def _flush(self, now: int) -> list[Event]:
@@ -584,8 +583,8 @@ class Discovery(DiscoveryProtocol):
                 self._negotiation.grace_over(source, topic)
             case ("module", str(name)):
                 self._liveness.expired(now, name)
-            case ("demand", str(topic), int(role), source) if self._demand is not None:
-                self._demand.expired(topic, role, source)
+            case ("demand", str(topic), int(role), source) if self._negotiation.demand is not None:
+                self._negotiation.demand.expired(topic, role, source)
             case ("peer", source):
                 self._negotiation.linger_over(source)
             case ("alias", int(kind), str(alias)):

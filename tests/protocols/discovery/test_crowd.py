@@ -188,6 +188,21 @@ def test_where_nothing_is_lost_a_subscription_ends_with_its_module_only() -> Non
     assert len(gone) == 1
 
 
+def test_what_no_module_knew_leaves_nothing_behind() -> None:
+    """Neither while the link is down, nor beside firmware alone, which has no message for the end."""
+    discovery = Discovery("PC1", 99)
+    discovery.set_lossless(0)
+    discovery.link_up(0)
+    for number in range(20):
+        if number == 10:
+            discovery.link_down(S)
+        discovery.subscribe(S, f"t{number}", 5)
+        discovery.add_endpoint(S, "node", f"t{number}", m.ROLE_SUBSCRIBES)
+        discovery.unsubscribe(S, f"t{number}")
+        discovery.remove_endpoint(S, "node", f"t{number}", m.ROLE_SUBSCRIBES)
+    assert not discovery._announcer._ended
+
+
 def test_an_endpoint_that_came_before_its_module_stays_where_nothing_is_lost() -> None:
     """The HELLO of before was lost, as there were faults."""
     discovery = Discovery("PC1", 99)
