@@ -19,7 +19,7 @@ TABLE = "params"
 
 
 class GivenValueError(ParameterError):
-    """A value given at the start that a parameter refuses: whoever gave it has to change it, not the program."""
+    """A parameter refuses a value that was given at the start. The user has to change the value, not the program."""
 
 
 class ParameterSource(msgspec.Struct, eq=False):

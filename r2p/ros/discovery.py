@@ -204,7 +204,7 @@ class RosDiscovery(DiscoveryProtocol):
         return [SubscribersGone(topic)]
 
     def set_published(self, topic: str, *, published: bool) -> list[Event]:
-        """Note that messages of ROS publishers arrive from now on, or none any more."""
+        """Note whether messages of ROS publishers arrive on the topic."""
         if published == (topic in self._found) or (published and (topic, ROLE_SUBSCRIBES) not in self.own):
             return []
         if published:

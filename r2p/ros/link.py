@@ -168,7 +168,7 @@ class RosLink(BufferedLink, MiddlewareUser):
         return any((other, role) in table for table in (self._ros.own, self._ros.peers) for role in _ROLES)
 
     def _travel(self, topic: str, name: str | None) -> tuple[RosTopic | None, str]:
-        """Return how a topic travels, or why it does not; for r2p's own topics there is no reason to give."""
+        """Return how a topic travels on ROS, or why it does not. The reason is empty for r2p's own topics."""
         asked = lookup(self.options.types, topic) or lookup(self.options.ros_types, topic)
         if is_own(topic) and not asked:
             return None, ""

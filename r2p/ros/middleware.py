@@ -169,7 +169,7 @@ class MiddlewareUser(Protocol):
         """
 
     def made_room(self) -> None:
-        """Go on sending: `Middleware.full` was true, and is not any more."""
+        """Resume sending: `Middleware.full` has become false again."""
 
     def notice(self, kind: str, text: str, *, trouble: bool) -> None:
         """Report something to the user, in words that say what to do. A text of one `kind` is reported once."""

@@ -156,7 +156,7 @@ class Announcer:
             self._announce_end(ItemKind.ENDPOINT_GONE, node, topic, role)
 
     def _announce_end(self, kind: ItemKind, *key: str | int) -> None:
-        """Announce the end of a subscription or endpoint; without a lease, it must be said also after an outage."""
+        """Announce the end of a subscription or endpoint, now or after an outage: others may keep it for good."""
         item = Item(kind, key, once=True)
         if self.outbox.up and (self.r2p or self._directory.has_addresses):  # firmware has no such message
             self._schedule.add(item)

@@ -137,7 +137,7 @@ class Send(msgspec.Struct, frozen=True):
 
 
 class SendTo(msgspec.Struct, frozen=True):
-    """Send these messages to the module at this address. Only links that have told discovery that they can get it."""
+    """Send these messages to the module at this address. Only links with addresses (`set_lossless`) get this event."""
 
     messages: tuple[bytes, ...]
     to: PeerAddress

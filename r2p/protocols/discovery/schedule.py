@@ -312,7 +312,7 @@ class Schedule:
 
     @property
     def _together(self) -> int:
-        """The number of items that one step repeats: several if nobody waits for an answer to any of them."""
+        """The number of items that one step repeats: more than one if none of them awaits an answer."""
         return max(1, min(_TOGETHER, len(self._slow))) if self._lossless and not self._ring else 1
 
     @property

@@ -13,7 +13,7 @@ from r2p.sim.buses.served import connect, not_served
 
 
 def attach(channel: str, options: AttachmentOptions | None = None) -> BusAttachment:
-    """Attach to the bus of that name; make it if there is none. Raises TransportError if that does not work."""
+    """Attach to the bus called `channel`, or create it. Raises TransportError if neither is possible."""
     options = options or AttachmentOptions()
     elsewhere = options.served
     if elsewhere is None:

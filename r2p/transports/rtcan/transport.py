@@ -47,7 +47,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
     `id`: 1 to 255; None: claim a free one. `priority`: 0 to 255, to be the master; 0: never. `slots`, `cycle` (nominal)
     and `bitrate` must be the same in the whole network. `profile`: auto, rtcan or firmware-2014. `utc`: how far the
     module's UTC may be off, if it is known: as the master it distributes UTC. `periods`: as the master, which ones it
-    admits together. `key`: shared by those that give orders. `topics`: of others, that are kept.
+    admits together. `key`: shared by those that give orders. `topics`: how many of others are kept.
     """
 
     id: int | None = None
