@@ -344,6 +344,9 @@ class Matching:
 
 def _type_of(tokens: dict[str, TopicToken]) -> TopicType:
     """Return the type that a session declares; of several tokens, the first that has one counts."""
+    if len(tokens) == 1:  # thousands, when a module joins
+        (only,) = tokens.values()
+        return TopicType(only.size, only.fingerprint, only.varies)
     size, varies = next(((each.size, each.varies) for each in tokens.values() if each.size or each.varies), (0, False))
     fingerprint = next((each.fingerprint for each in tokens.values() if each.fingerprint != ANY_TYPE), ANY_TYPE)
     return TopicType(size, fingerprint, varies)

@@ -85,6 +85,9 @@ class ZenohLink(Link):
             hub.space.module, hub.instance, observer=hub.observer, counts=counts, tokens_max=tokens_max
         )
         super().__init__(name, hub, discovery=self._liveliness)
+        self.down = asyncio.Event()
+        """Set while the link is not up."""
+        self.down.set()
         self._session: ZenohSession | None = None
         self._prefix = ""
         self._queues: list[LoopQueue] = []
@@ -169,11 +172,13 @@ class ZenohLink(Link):
         return self.receiver.window(topic)
 
     def on_up(self) -> None:
+        self.down.clear()
         self.receiver.on_up()
         super().on_up()
         self._tokens.on_up()  # last: to a subscriber that appears something may be sent at once
 
     def on_down(self, reason: str) -> None:
+        self.down.set()
         self._tokens.on_down()
         self.receiver.on_down()
         super().on_down(reason)

@@ -271,6 +271,7 @@ class ZenohSender:
 
     def add_subscriber(self, topic: str, session: int, window: int) -> None:
         """Add a subscriber whose token appeared, or change its window."""
+        self.credits.wait()
         subscriber = self.subscriber(topic)
         current = subscriber is not None and subscriber.topic is self.topics.get(topic)
         if subscriber is not None and current and subscriber.has_session(session):  # messages reach it already
@@ -354,9 +355,9 @@ class CreditReader:
         self._pause: asyncio.TimerHandle | None = None
 
     def connect(self, session: ZenohSession, key: str) -> None:
-        """Subscribe to this module's credit."""
-        self._reader = session.subscribe(key, _CREDIT_RING, self._on_credit)
-        self._waits = True
+        """Subscribe to this module's credit. A thread waits for it from the first subscriber on: it wakes up often."""
+        self._reader = session.subscribe(key, _CREDIT_RING, self._on_credit, waits=False)
+        self._waits = False
 
     def receive(self) -> None:
         """Read the credit; waiting publishers go on after the present work."""
@@ -367,7 +368,7 @@ class CreditReader:
                 self._loop.call_soon(self.serve)
 
     def wait(self) -> None:
-        """Read the next credit as soon as it arrives: a publisher waits."""
+        """Read the next credit as soon as it arrives."""
         if self._reader is not None and not self._waits:
             self._waits = True
             self._reader.wait()

@@ -120,19 +120,22 @@ class SubscriptionReader:
         subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]",
         loop: asyncio.AbstractEventLoop,
         on_sample: Callable[[zenoh.Sample], None],
+        *,
+        waits: bool = True,
     ) -> None:
+        """`waits`: call `on_sample` with the first sample; otherwise `wait` starts that."""
         self._subscriber = subscriber
         self._loop = loop
         self._on_sample = on_sample
         self._try_receive = subscriber.handler.try_recv
         self._passed: deque[zenoh.Sample] = deque()  # samples that the thread has passed to the loop
         self._received = 0  # ... of which the loop has received so many; the thread compares that with what it passed
-        self._waits = True  # whether `on_sample` is to be called with the next sample
-        self._thread_paused = False
+        self._waits = waits  # whether `on_sample` is to be called with the next sample
+        self._thread_paused = not waits
         self._closed = False
         self._resume_thread = threading.Lock()
         self._resume_thread.acquire()
-        threads.start_thread(self._run, "reader")
+        threads.start_thread(functools.partial(self._run, waits), "reader")
 
     def receive(self) -> zenoh.Sample | None:
         """Return the next waiting sample, or None."""
@@ -158,10 +161,12 @@ class SubscriptionReader:
         with contextlib.suppress(RuntimeError):  # the thread waits for a sample, and was not paused
             self._resume_thread.release()
 
-    def _run(self) -> None:
+    def _run(self, waits: bool) -> None:
         """Pass samples, in the thread; pause while the loop has not received the last but one."""
         receive = self._subscriber.handler.recv
         count = 0
+        if not waits:
+            self._resume_thread.acquire()
         with contextlib.suppress(zenoh.ZError, RuntimeError):  # it is undeclared; the loop is closed
             while not self._closed:
                 sample = receive()
@@ -214,7 +219,7 @@ class ZenohSession:
         self.outbound = OutboundThread(asyncio.get_running_loop(), on_error)
         self.large = OutboundThread(asyncio.get_running_loop(), on_error)
         """The thread that hands large messages to zenoh."""
-        self._declared: list[Any] = []  # kept, as zenoh undeclares what Python collects
+        self._declared: list[object] = []  # kept, as zenoh undeclares what Python collects
         self._publishers: set[zenoh.Publisher] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._token_count = 0
@@ -233,8 +238,8 @@ class ZenohSession:
             shared: object = getattr(event.transport, "is_shm", False)  # not in zenoh's stubs
             queue.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT, bool(shared)))
 
-        events: FifoChannel[zenoh.TransportEvent] = FifoChannel(_CHANNEL_MAX)
-        self.forward(self._session.info.declare_transport_events_listener(events, history=True), changed, queue)
+        declare = self._session.info.declare_transport_events_listener
+        self._call_back(functools.partial(declare, history=True), changed, queue)
 
     def watch_tokens(self, prefix: str, queue: LoopQueue) -> None:
         """Report each token under a prefix, present ones included: (rest of its key, whether it exists)."""
@@ -246,9 +251,8 @@ class ZenohSession:
             self.outbound.set_token_count(self._token_count)
             queue.put((liveliness.token_of(str(sample.key_expr)[start:]), there))
 
-        tokens: FifoChannel[zenoh.Sample] = FifoChannel(_TOKENS_MAX)
-        declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
-        self.forward(declared, changed, queue)
+        declare = self._session.liveliness().declare_subscriber
+        self._call_back(functools.partial(declare, f"{prefix}/**", history=True), changed, queue)
 
     def query_tokens(self, prefix: str, timeout: float, queue: LoopQueue) -> None:
         """Query the tokens under a watched prefix: the rest of each key, and finally whether these are all. A thread of
@@ -290,9 +294,8 @@ class ZenohSession:
         def arrived(sample: zenoh.Sample) -> None:
             queue.put((_bytes_of(sample.attachment), _bytes_of(sample.payload)))
 
-        messages: FifoChannel[zenoh.Sample] = FifoChannel(_CHANNEL_MAX)
-        declared = self._session.declare_subscriber(key, messages, allowed_origin=zenoh.Locality.REMOTE)
-        self.forward(declared, arrived, queue)
+        declare = functools.partial(self._session.declare_subscriber, key, allowed_origin=zenoh.Locality.REMOTE)
+        self._call_back(declare, arrived, queue)
 
     def answer_queries(
         self, key: str, answer: Callable[[str], bytes | None], make_queue: Callable[[Callable[[Any], None]], LoopQueue]
@@ -308,39 +311,28 @@ class ZenohSession:
                 query.drop()
 
         queue = make_queue(reply)
-        queries: FifoChannel[zenoh.Query] = FifoChannel(_CHANNEL_MAX)
-        self.forward(self._session.declare_queryable(key, queries), queue.put, queue)
+        self._call_back(functools.partial(self._session.declare_queryable, key), queue.put, queue)
 
-    def forward(self, declared: Any, put: Callable[[Any], object], queue: LoopQueue) -> None:
-        """Call `put` in a thread with each item of what was declared with a channel; `queue` counts its errors."""
+    def _call_back(self, declare: Callable[..., object], put: Callable[[Any], object], queue: LoopQueue) -> None:
+        """Declare something until the session is closed: a thread calls `put` with each item; `queue` counts errors."""
 
-        def listen() -> None:
-            receive = declared.handler.recv
-            while True:
-                try:
-                    item = receive()
-                except zenoh.ZError:  # it is undeclared
-                    return
-                try:
-                    put(item)
-                except BaseException as error:  # noqa: BLE001 - a panic, too: counted in the loop; the next one follows
-                    queue.count_error(as_exception(error))
+        def received(item: Any) -> None:
+            try:
+                put(item)
+            except BaseException as error:  # noqa: BLE001 - a panic, too: counted in the loop; the next item follows
+                queue.count_error(as_exception(error))
 
-        self._declared.append(declared)
-        threads.start_thread(listen, "listener")
+        self._declared.append(threads.declare(declare, received))
 
-    def undeclare(self, declared: Any) -> None:
-        """End what was given to `forward`."""
-        self._declared.remove(declared)
-        declared.undeclare()
-
-    def subscribe(self, key: str, most: int, on_sample: Callable[[zenoh.Sample], None]) -> SubscriptionReader:
-        """Call `on_sample` in the loop with the first sample; later ones are received from the reader. Of more than
-        `most` waiting ones, the oldest are lost.
+    def subscribe(
+        self, key: str, most: int, on_sample: Callable[[zenoh.Sample], None], *, waits: bool = True
+    ) -> SubscriptionReader:
+        """Call `on_sample` in the loop with the first sample, if not only after the reader's `wait`; later ones are
+        received from the reader. Of more than `most` waiting ones, the oldest are lost.
         """
         handler: RingChannel[zenoh.Sample] = RingChannel(most)
         subscriber = self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE)
-        return SubscriptionReader(subscriber, asyncio.get_running_loop(), on_sample)
+        return SubscriptionReader(subscriber, asyncio.get_running_loop(), on_sample, waits=waits)
 
     def declare_publisher(self, key: str, publisher_class: PublisherClass, *, large: bool = False) -> zenoh.Publisher:
         """Declare a publisher with the priority of the class, and whether its messages may be large.

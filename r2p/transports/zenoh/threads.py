@@ -9,12 +9,15 @@ these calls, one after the other, and the event loop goes on.
 
 import asyncio
 import atexit
+import concurrent.futures
 import contextlib
 import queue
 import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 from weakref import WeakSet
+
+from zenoh.handlers import Callback
 
 T = TypeVar("T")
 
@@ -35,6 +38,7 @@ _JOIN_TIMEOUT_S = 2.0
 """Seconds for which the end of the program waits for a thread: one that connects in vain may take longer."""
 
 _threads: WeakSet[threading.Thread] = WeakSet()
+_callback_ends: WeakSet[threading.Event] = WeakSet()
 
 
 def start_thread(function: Callable[[], object], name: str) -> threading.Thread:
@@ -43,6 +47,29 @@ def start_thread(function: Callable[[], object], name: str) -> threading.Thread:
     _threads.add(thread)
     thread.start()
     return thread
+
+
+def declare(declare: Callable[..., T], received: Callable[[Any], object]) -> T:
+    """Call `declare` with the handler of what it declares: `received` is called with each item, in a thread of its own,
+    which does not keep the program from ending.
+
+    That thread is one of zenoh: it sleeps until there is something, where `recv` of a channel wakes up ten times a
+    second, and it takes eight times as many items a second beside a busy event loop. Behind 256 items zenoh waits for
+    it, with its connection. So `received` only hands the item on.
+    """
+    ended = threading.Event()
+    _callback_ends.add(ended)
+    handler = Callback(received, ended.set)
+    declared: concurrent.futures.Future[T] = concurrent.futures.Future()
+
+    def run() -> None:
+        try:
+            declared.set_result(declare(handler))
+        except BaseException as error:  # noqa: BLE001 - a panic of zenoh, too: raised where this was called
+            declared.set_exception(as_exception(error))
+
+    start_thread(run, "declaration")  # its child is a daemon like itself
+    return declared.result()
 
 
 def as_exception(error: BaseException) -> Exception:
@@ -62,6 +89,8 @@ def _join() -> None:
     # A daemon thread that is inside of zenoh when Python ends aborts the process.
     for thread in list(_threads):
         thread.join(_JOIN_TIMEOUT_S)
+    for ended in list(_callback_ends):
+        ended.wait(_JOIN_TIMEOUT_S)
 
 
 class OutboundThread:

@@ -128,6 +128,7 @@ class ZenohTransport(Transport):
         """Report the reason whenever the link is down; never returns."""
         reason = ""
         while True:
+            await link.down.wait()
             await asyncio.sleep(_DIAGNOSE_EVERY_S)
             if link.up:
                 continue

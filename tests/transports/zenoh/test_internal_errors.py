@@ -51,7 +51,7 @@ async def test_credits() -> None:
     sent = [Credit(7, PublisherClass.NON_REAL_TIME, 5, each) for each in "abc"]
     waiting = [SimpleNamespace(payload=Payload(encode_credit(each))) for each in sent]
     session: Any = SimpleNamespace(
-        subscribe=lambda *_: SimpleNamespace(
+        subscribe=lambda *_, **__: SimpleNamespace(
             receive=lambda: waiting.pop(0) if waiting else None, wait=lambda: None, close=lambda: None
         )
     )

@@ -361,9 +361,9 @@ async def test_modules_share_no_wildcard_of_which_zenoh_would_keep_memory(monkey
     keys: Counter[str] = Counter()
 
     def recorded(declare: Callable[..., Any]) -> Callable[..., Any]:
-        def declared(session: ZenohSession, key: str, *args: Any) -> Any:
+        def declared(session: ZenohSession, key: str, *args: Any, **options: Any) -> Any:
             keys[key] += 1
-            return declare(session, key, *args)
+            return declare(session, key, *args, **options)
 
         return declared
 
@@ -384,6 +384,8 @@ async def test_garbage_and_foreign_keys_are_counted_and_do_no_harm() -> None:
     async with nodes(net, "A", "B") as (alice, bob), alien_on(net) as alien:
         publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
         await publisher.wait_subscriber()
+        answers, _ = bob.advertise("answers", Led), alice.subscribe("answers", Led)
+        await answers.wait_subscriber()  # so bob reads credit
         live = alien.liveliness()
         tokens = [
             live.declare_token(f"r2p/lab/live/{key}") for key in ("x", "1/zz/module/A/1/0/0", "9/1/module/A/1/0/0")

@@ -3,7 +3,8 @@
 import asyncio
 import queue
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -164,27 +165,45 @@ async def test_what_raises_does_not_stop_what_comes_behind_it() -> None:
             ended.set()
         taken.append(10 // item)
 
-    queue = LoopQueue(loop, take, losses, most=9)
+    def take_message(message: "int | tuple[bytes, bytes]") -> None:
+        take(message if isinstance(message, int) else len(message[1]))
+
+    queue = LoopQueue(loop, take_message, losses, most=9)
     for number in (5, 0, 2, 0, 1):
         queue.put(number)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert (taken, losses) == ([2, 5, 10], {"internal error": 2})
 
-    channel, nothing = Channel(), None
-    session = ZenohSession(nothing, losses.internal_error)  # type: ignore[arg-type]
-    session.forward(channel, lambda item: queue.put(len(item)), queue)
-    channel.put_all(["12345", 7, "1234567890"])
+    bare = Zenoh()
+    stand_in: Any = bare
+    ZenohSession(stand_in, losses.internal_error).listen("key", queue)
+    bare.received(Sample(zenoh.ZBytes(b"12345")))
+    bare.received(7)
+    bare.received(Sample(zenoh.ZBytes(b"1234567890")))
     await ended.wait()
-    channel.undeclare()
     assert (taken[3:], losses) == ([2, 1], {"internal error": 3})
+
+
+@dataclass
+class Sample:
+    """Stands for zenoh's."""
+
+    payload: zenoh.ZBytes
+    attachment: None = None
 
 
 class Zenoh:
     """Stands for zenoh's session: notes what is undeclared, and when it is closed."""
 
+    received: Callable[[object], None]
+
     def __init__(self) -> None:
         self.calls: list[str] = []
+
+    def declare_subscriber(self, key: str, received: Callable[[object], None], **_options: object) -> "Declared":
+        self.received = received
+        return Declared(key, self.calls)
 
     def declare_publisher(self, key: str, **_options: object) -> "Declared":
         return Declared(key, self.calls)

@@ -1,6 +1,7 @@
 """The calls that may wait for zenoh, made at once, or by a thread while there are very many tokens; and its threads."""
 
 import asyncio
+import queue
 import subprocess
 import sys
 import threading
@@ -10,17 +11,22 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import zenoh
 
+from benchmarks.zenoh import bare_config
 from r2p.protocols.flow_control import SendWindow
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.publish import PublisherCache, TxStream
 from r2p.transports.zenoh.session import _in_thread
-from r2p.transports.zenoh.threads import MANY_TOKENS, PENDING_URGENT_MAX, OutboundThread
+from r2p.transports.zenoh.threads import MANY_TOKENS, PENDING_URGENT_MAX, OutboundThread, declare
 from tests.transports.cables import GUARD
 from tests.transports.zenoh.test_publish import ORIGIN
 
 pytestmark = pytest.mark.anyio
+
+BEHIND = 256
+"""Items that may wait for a callback of zenoh."""
 
 
 class Busy:
@@ -216,3 +222,25 @@ def test_the_program_waits_for_its_threads() -> None:
     """Python that ends while a thread is inside of zenoh would abort the process."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], input="heard", capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("heard\n", "")
+
+
+@pytest.mark.one_loop
+async def test_what_zenoh_calls_back_gets_more_than_fits_and_ends_with_the_session() -> None:
+    tokens, received = 3 * BEHIND, queue.SimpleQueue[threading.Thread]()
+    with zenoh.open(bare_config("peer", "listen", 0, shm=False)) as session:
+        kept = [session.liveliness().declare_token(f"token/{number}") for number in range(tokens)]
+        subscribe = partial(session.liveliness().declare_subscriber, "token/*", history=True)
+        declared = await asyncio.to_thread(declare, subscribe, lambda _: received.put(threading.current_thread()))
+        threads = {await asyncio.to_thread(received.get) for _ in kept}
+        (thread,) = threads
+        assert thread.daemon, "a program that does not close its session would not end"
+    await asyncio.to_thread(thread.join)
+    del declared
+
+
+async def test_what_can_not_be_declared_raises_where_it_was_called() -> None:
+    def refuse(_handler: object) -> None:
+        raise zenoh.ZError("closed")
+
+    with pytest.raises(zenoh.ZError, match="closed"):
+        declare(refuse, print)
