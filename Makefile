@@ -21,7 +21,7 @@ test: $(STAMP) system
 # The tests with the lowest versions that pyproject.toml allows; `make test-lowest TESTS=tests/tools` runs some of them.
 test-lowest: $(LOWEST)/stamp system
 	$(if $(CI)$(PEERS),@$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --group browser)
-	$(LOWEST)/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS)
+	$(LOWEST)/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS)
 
 # The tests with other Pythons, of those that this machine has: `make test-pythons PYTHONS=3.13 TESTS=tests/tools`.
 test-pythons:
@@ -33,7 +33,7 @@ test-python-%: $(BIN)/uv system
 	if $(BIN)/uv python find --quiet --no-python-downloads $* >/dev/null 2>&1; then \
 		$(MAKE) --no-print-directory .venv-$*/stamp && \
 		$(if $(CI)$(PEERS),$(BIN)/uv pip install --quiet --python .venv-$* --group browser &&) \
-		.venv-$*/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS); \
+		.venv-$*/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS); \
 	else echo "Python $* is not on this machine: skipped"; fi
 
 lint: $(STAMP)

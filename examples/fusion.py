@@ -114,5 +114,9 @@ def fuse(path: str) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    for name, error in fuse(*sys.argv[1:2] or sys.exit(__doc__)).items():
+    try:
+        errors = fuse(*sys.argv[1:2] or sys.exit(__doc__))
+    except r2p.BagError as reason:
+        sys.exit(str(reason))
+    for name, error in errors.items():
         print(f"{name:24} {error:6.3f} m")

@@ -210,7 +210,9 @@ def rtcan_responses(
                     shared.bus.timeline.at(SETTLED + arrival.queued, publish, SETTLED + arrival.queued)
             for name, instants in discovery.items():
                 for number, instant in enumerate(instants):
-                    payload = number.to_bytes(4, "big") * (management.SIZE // 4)
+                    # Without zeros, so that it takes all frames that a message may take.
+                    parts = bytes(0x80 | number >> shift & 0x7F for shift in (21, 14, 7, 0))
+                    payload = parts * (management.SIZE // len(parts))
                     shared.bus.timeline.at(SETTLED + instant, nodes[name].discover, payload)
             await asyncio.sleep(duration / SECOND)
             for task in running:

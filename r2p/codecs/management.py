@@ -141,7 +141,7 @@ HELLO_ALIAS = 16  # `module` is the alias of a longer name, which NAME has
 LEASE_MS_MAX = 0xFFFF
 """The longest lease that a Hello can carry (ms)."""
 
-WIRE_VERSION = 3
+WIRE_VERSION = 4
 """Hello.wire: the version of PROTOCOL.md, which grows when modules of before can't understand all of what is new."""
 WIRE_CROWD = 3
 """The wire version from which on modules repeat topics slowly in a crowd, and keep those of others for so long."""

@@ -7,8 +7,11 @@ This module alone knows the layout of an identifier: hot paths elsewhere shift a
 
 The messages of a topic are all of one size, or their length varies: then each begins with its length and a checksum, as
 frames say only how many of them follow.
+
+r2p's management, of 32 bytes each, travels without most of its zeros, and the first frame of such a message is marked.
 """
 
+import re
 import struct
 from binascii import crc_hqx
 
@@ -49,6 +52,10 @@ MESSAGE_MASK = MESSAGE_MAX << MESSAGE_SHIFT
 NOT_SYNC = ~ID8_MASK  # a sync frame has none of these bits: it has the cycle counter in place of an id8
 CYCLE_MASK = 0xFF  # a sync frame carries these bits of the cycle counter
 
+FIRST_MARK = 0x40  # in the fragments left of a message without its zeros: this is its first frame
+
+_ZEROS = re.compile(rb"\0+")
+_PACKED_ZEROS = re.compile(rb"\0(.)", re.DOTALL)
 _ALL_SLOTS = (1 << SLOTS_MAX) - 1
 _HEADER = struct.Struct("<HH")  # length and checksum
 _CRC_START = 0xFFFF  # CRC-16/CCITT-FALSE: polynomial 0x1021, not reflected, no final XOR
@@ -170,6 +177,24 @@ def decode_variable(data: bytes) -> bytes:
     if len(data) < HEADER_SIZE or _HEADER.unpack_from(data) != (len(payload), crc_hqx(payload, _CRC_START)):
         raise DecodeError(f"{len(data)} bytes with another length or checksum than their header says")
     return payload
+
+
+def pack_management(data: bytes) -> bytes:
+    """Return a management message as it travels between r2p modules: each run of zeros as a zero and its length, and
+    none in front of the type byte. One that this would not make shorter stays as it is.
+    """
+    packed = _ZEROS.sub(lambda run: bytes((0, len(run[0]))), data[:-1].rstrip(b"\0")) + data[-1:]
+    return packed if len(packed) < len(data) else data
+
+
+def unpack_management(packed: bytes, size: int) -> bytes:
+    """Return a management message of `size` bytes with its zeros. Raises `DecodeError` if it would be longer."""
+    if len(packed) == size:
+        return packed
+    body = _PACKED_ZEROS.sub(lambda run: bytes(run[1][0]), packed[:-1])
+    if not packed or len(body) >= size:
+        raise DecodeError(f"{len(packed)} bytes are no management message of {size} bytes without its zeros")
+    return body.ljust(size - 1, b"\0") + packed[-1:]
 
 
 def beginning_of(data: bytes, left: int, *, empty: bool = False) -> int:

@@ -42,7 +42,7 @@ from r2p.names import (
 )
 from r2p.parameters.file import ParameterFile
 from r2p.parameters.registry import ModuleParameters
-from r2p.parameters.sources import GivenParameters, given
+from r2p.parameters.sources import GivenParameters, GivenValueError, given
 from r2p.protocols.discovery.events import Command
 from r2p.runtime.events import EventHub, EventListener
 from r2p.runtime.node import Node, no_log
@@ -195,7 +195,8 @@ class Module:
         crashed = list(self._nodes.crashes.values())
         if crashed and (error is None or isinstance(error, asyncio.CancelledError)):
             nodes = f"node{'s'[: len(crashed) - 1]} {', '.join(self._nodes.crashes)}"
-            raise NodeCrashed(f"{nodes} of module {self.name} crashed", crashed)
+            given = all(isinstance(each, GivenValueError) for each in crashed)
+            raise NodeCrashed(f"{nodes} of module {self.name} {'did not start' if given else 'crashed'}", crashed)
         for crash in crashed:
             assert error is not None
             error.add_note(f"before that: {crash!r} {' '.join(crash.__notes__)}")

@@ -416,4 +416,5 @@ def test_options_reach_the_nodes_and_a_value_that_does_not_fit_is_an_error_of_it
     )
     assert (code, out) == (1, "7.0 3\n")
     assert "node arm can't start: PC1/arm.kp = 'fast': it takes an int (from --param)" in err
+    assert "node arm of module PC1 did not start" in err
     assert "Traceback" not in err  # no mistake of the program

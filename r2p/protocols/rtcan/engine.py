@@ -418,7 +418,7 @@ class Engine:
             self._management_ends = message == rtcan.FIRMWARE_MANAGEMENT and frame.id & rtcan.LEFT_MASK == 1
         ours = message == rtcan.FIRMWARE_MANAGEMENT if firmware else high == MANAGEMENT
         if ours:  # of each sender by itself: they interleave, and none is known before
-            self.reassembly.subscribe(message, management.SIZE)
+            self.reassembly.subscribe(message, management.SIZE, packed=not firmware)
         received = self.reassembly.receive(frame, stamp)
         if received is not None and ours:
             self._on_management(now, received)

@@ -120,7 +120,11 @@ class ManagementSender:
         """Send a message; before the others, if it is urgent. One that waits already is not sent twice."""
         if self._detector.profile is not Profile.FIRMWARE:
             message = self._message_id()
-            if urgent or handle is not None or not self._transmitter.queue.repeats(message, data):
+            if (
+                urgent
+                or handle is not None
+                or not self._transmitter.queue.repeats(message, rtcan.pack_management(data))
+            ):
                 within, floor = (_URGENT, SRT_MIN) if urgent else (DEADLINE, _floor(data))
                 self._enqueue(now, message, data, handle, within, floor)
             return
@@ -146,8 +150,18 @@ class ManagementSender:
         floor: int = SRT_MIN,
         subject: Hashable = None,
     ) -> None:
-        deadline = now + within
-        outgoing = QueuedMessage(message, data, deadline, drop=False, handle=handle, floor=floor, subject=subject)
+        marked = message != rtcan.FIRMWARE_MANAGEMENT
+        payload = rtcan.pack_management(data) if marked else data
+        outgoing = QueuedMessage(
+            message,
+            payload,
+            now + within,
+            drop=False,
+            handle=handle,
+            floor=floor,
+            subject=subject,
+            marked=marked and len(payload) < len(data),
+        )
         if self._transmitter.queue.put(outgoing, urgent=floor < DISCOVERY, management=True):
             self._transmitter.reschedule(now)
         else:

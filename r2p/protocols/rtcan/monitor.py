@@ -261,7 +261,7 @@ class Monitor:
             "" if kind is FrameKind.SYNC else self.directory.topic(message),
             "" if kind is FrameKind.SYNC else self.directory.module(message),
             identifier.laxity,
-            identifier.left,
+            identifier.left & ~rtcan.FIRST_MARK if kind is FrameKind.MANAGEMENT else identifier.left,
             bits + can_bits.INTERMISSION,
             rtcan.fragment_count(size) if size and size <= rtcan.PAYLOAD_MAX else None,
             self._cycle if self._sync is not None else None,
@@ -374,7 +374,8 @@ class Monitor:
         self._nrt = stamp
 
     def _management_text(self, frame: Frame, message: int, stamp: int) -> str:
-        self._reassembly.subscribe(message, management.SIZE)
+        packed = message != rtcan.FIRMWARE_MANAGEMENT
+        self._reassembly.subscribe(message, management.SIZE, packed=packed)
         received = self._reassembly.receive(frame, stamp)
         if received is None:
             return ""

@@ -19,7 +19,7 @@ from collections.abc import Callable, Hashable, Iterator
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import FRAME_MAX, LAXITY_SHIFT, MESSAGE_SHIFT, NRT, SRT_MAX, SRT_MIN, Frame
+from r2p.codecs.rtcan import FIRST_MARK, FRAME_MAX, LAXITY_SHIFT, MESSAGE_SHIFT, NRT, SRT_MAX, SRT_MIN, Frame
 from r2p.units import LONG_AGO, MILLISECOND, NEVER, SECOND
 
 REQUEST = rtcan.SRT_MIN + 1
@@ -39,7 +39,7 @@ class QueuedMessage(msgspec.Struct, eq=False):
     Once its first frame is sent it is always finished: firmware of 2014 loses the next message as well when the end of
     one is missing. `recalled`: its frame was withdrawn, as the node uses the bus in another way from now on. `floor`:
     its least laxity while it is overdue, unless it is `starved`. `subject`: what it is about; a later one about the
-    same makes it needless.
+    same makes it needless. `marked`: so is its first frame, as frames of management without its zeros are.
     """
 
     message: int
@@ -56,6 +56,7 @@ class QueuedMessage(msgspec.Struct, eq=False):
     floor: int = SRT_MIN
     starved: bool = False
     subject: Hashable = None
+    marked: bool = False
 
     @property
     def expiry(self) -> int:
@@ -203,6 +204,8 @@ class LaxityQueue:
         at = message.sent * FRAME_MAX
         # `encode_identifier` inlined: it would repeat the checks of the message for each frame.
         identifier = laxity << LAXITY_SHIFT | message.message << MESSAGE_SHIFT | message.frames - 1 - message.sent
+        if message.marked and not message.sent:
+            identifier |= FIRST_MARK
         return Frame(identifier, message.payload[at : at + FRAME_MAX])
 
     def put_back(self, message: QueuedMessage, hold: int = LONG_AGO) -> None:

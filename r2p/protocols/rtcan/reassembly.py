@@ -5,7 +5,7 @@ varies, by a header whose length fits that number. A frame that does not continu
 the rest is skipped up to the next beginning. A repeat of the last frame, which CAN can make, is not a gap.
 
 Where the length varies, frames of two messages can look like one: then the checksum is wrong, and the message counts as
-"damaged".
+"damaged". Management without its zeros is shorter than its size says: there the first frame is marked.
 """
 
 from collections import Counter, defaultdict
@@ -13,7 +13,7 @@ from collections import Counter, defaultdict
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import FRAME_MAX, HEADER_SIZE, LEFT_MASK, MESSAGE_MAX, MESSAGE_SHIFT, Frame
+from r2p.codecs.rtcan import FIRST_MARK, FRAME_MAX, HEADER_SIZE, LEFT_MASK, MESSAGE_MAX, MESSAGE_SHIFT, Frame
 from r2p.errors import DecodeError
 from r2p.protocols.rtcan.events import Received
 from r2p.units import NEVER
@@ -26,7 +26,8 @@ _UNKNOWN = -1  # `SourceBuffer.first` between two messages whose length varies
 
 class SourceBuffer(msgspec.Struct, eq=False):
     """The unfinished message of one publisher. All of them have `size` bytes, and begin with `first` fragments left; if
-    their length `varies`, each has its own, and `empty` says that all are.
+    their length `varies`, each has its own, and `empty` says that all are. If they are `packed`, those with a marked
+    first frame are without their zeros.
 
     With `parts`, a message is being received and `expected` is the number of its next frame; without, frames from
     `expected` down are the rest of a lost one. `tail` is the last frame of the previous message.
@@ -37,6 +38,7 @@ class SourceBuffer(msgspec.Struct, eq=False):
     size: int
     varies: bool = False
     empty: bool = False
+    packed: bool = False
     expected: int = _IDLE
     parts: list[bytes] = msgspec.field(default_factory=list)
     identifier: int = 0
@@ -55,14 +57,17 @@ class Reassembly:
         self.open: dict[int, SourceBuffer] = {}
         """Unfinished messages by id, the oldest first."""
 
-    def subscribe(self, message: int, size: int, *, varies: bool = False) -> None:
-        """Receive messages with this id, of `size` bytes, or at most so many. Raises `MessageError` beyond 1..1024."""
+    def subscribe(self, message: int, size: int, *, varies: bool = False, packed: bool = False) -> None:
+        """Receive messages with this id, of `size` bytes, or at most so many. Raises `MessageError` beyond 1..1024.
+
+        If they are `packed`, they may come without their zeros; `receive` returns them with these.
+        """
         before = self._buffers.get(message)
         if varies:
             if before is None or (before.varies, before.empty) != (True, not size):
                 self._enter(SourceBuffer(message, _UNKNOWN, 0, varies=True, empty=not size))
         elif before is None or before.varies or before.size != size:
-            self._enter(SourceBuffer(message, rtcan.fragment_count(size) - 1, size))
+            self._enter(SourceBuffer(message, rtcan.fragment_count(size) - 1, size, packed=packed))
 
     def unsubscribe(self, message: int) -> None:
         """Stop receiving messages with this id; an unfinished one is lost."""
@@ -132,7 +137,8 @@ class Reassembly:
             return self._begin(buffer, frame, left, stamp)
         if left == buffer.expected:
             return self._continue(buffer, frame, stamp)
-        if left == buffer.expected + 1 and frame.data == buffer.parts[-1]:
+        number = left & ~FIRST_MARK if buffer.packed else left
+        if number == buffer.expected + 1 and frame.data == buffer.parts[-1]:
             self._lose(buffer.message, "repeat")
             return None
         self._reset(buffer, "gap")
@@ -148,6 +154,11 @@ class Reassembly:
             buffer.size = _size_of_beginning(buffer, frame, left, rest=rest)
             begins = buffer.size > 0
             buffer.first = left if begins else _UNKNOWN
+        elif buffer.packed:
+            whole = rtcan.fragment_count(buffer.size) - 1
+            marked, left = left & FIRST_MARK, left & ~FIRST_MARK
+            begins = left <= whole if marked else left == whole and not rest
+            buffer.first = left if marked and begins else whole
         if begins:
             buffer.identifier, buffer.started = frame.id, stamp
             return self._continue(buffer, frame, stamp)
@@ -164,7 +175,8 @@ class Reassembly:
         data, left = frame.data, buffer.first - len(buffer.parts)
         buffer.last = stamp
         # Only the last frame may be shorter.
-        if len(data) != (FRAME_MAX if left else buffer.size - buffer.first * FRAME_MAX):
+        packed = buffer.packed and buffer.identifier & FIRST_MARK
+        if len(data) != (FRAME_MAX if left else len(data) if packed else buffer.size - buffer.first * FRAME_MAX):
             self._reset(buffer, "damaged" if buffer.varies else "wrong length")
             buffer.expected = left  # the rest of it, unless it begins another message
             return self._begin(buffer, frame, left, stamp)
@@ -179,6 +191,12 @@ class Reassembly:
         buffer.tail = data
         if buffer.varies:
             return self._check_variable(buffer, payload, frame, stamp)
+        if packed:
+            try:
+                payload = rtcan.unpack_management(payload, buffer.size)
+            except DecodeError:
+                self._lose(buffer.message, "damaged")
+                return None
         return Received(buffer.identifier, payload, buffer.started)
 
     def _check_variable(self, buffer: SourceBuffer, data: bytes, frame: Frame, stamp: int) -> Received | None:

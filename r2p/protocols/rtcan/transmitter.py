@@ -14,7 +14,7 @@ import msgspec
 
 from r2p.codecs import can_bits, rtcan
 from r2p.codecs.can_bits import INTERMISSION
-from r2p.codecs.management import ManagementType, type_of
+from r2p.codecs.management import Network
 from r2p.codecs.rtcan import FRAME_MAX, LAXITY_SHIFT, Frame
 from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, CycleState
@@ -216,7 +216,7 @@ class SlotTransmitter:
     def withdraw_network(self, id8: int) -> None:
         """Drop a NETWORK message in the queue, because it is out of date."""
         message = rtcan.message_id(rtcan.MANAGEMENT, id8)
-        self.queue.withdraw(message, lambda each: type_of(each.payload) == ManagementType.NETWORK)
+        self.queue.withdraw(message, lambda each: each.subject is Network)
 
     def forget(self, periodic: PeriodicMessage) -> None:
         """Stop sending a periodic message that has ended."""

@@ -10,7 +10,7 @@ import msgspec
 from r2p.analysis import BusMessage, MessageClass, SlotSupply, management_load
 from r2p.bus import BusMonitor, FrameKind, SeenFrame, Timing
 from r2p.codecs import PublisherClass, rtcan
-from r2p.tools.bus.reported import declared_otherwise, named
+from r2p.tools.bus.reported import MANAGEMENT_FRAMES, declared_otherwise, named
 from r2p.units import MILLISECOND, SECOND
 
 CONTROL_LAXITY_MAX = 10
@@ -32,11 +32,13 @@ class SeenMessage(msgspec.Struct):
     control: int = 0
 
     def see(self, frame: SeenFrame) -> None:
-        """Take in a frame; the first of a message has the most frames left."""
+        """Take in a frame; the first of a message has the most frames left, or a mark."""
         self.topic, self.module = frame.topic, frame.module
-        if frame.left + 1 > self.frames:  # the ones before were the rest of a message
+        if self.kind is FrameKind.MANAGEMENT:
+            self.frames = MANAGEMENT_FRAMES
+        elif frame.left + 1 > self.frames:  # the ones before were the rest of a message
             self.frames, self.begins, self.laxity, self.control = frame.left + 1, [], 0, 0
-        if frame.left == self.frames - 1:
+        if frame.left == self.frames - 1 or (self.kind is FrameKind.MANAGEMENT and frame.frame.id & rtcan.FIRST_MARK):
             self.begins.append(frame.stamp)
             self.laxity = max(self.laxity, frame.laxity)
             self.control += frame.laxity <= CONTROL_LAXITY_MAX

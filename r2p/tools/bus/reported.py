@@ -25,7 +25,8 @@ from r2p.units import SECOND
 _NAMED = 5  # topics that a line names
 _REPORT = 6.0  # s until a module of the bus, which agree on one of them, has published both topics
 _LOOK = 1.0  # s between two looks for new buses
-_MANAGEMENT_FRAMES = rtcan.fragment_count(management.SIZE)
+MANAGEMENT_FRAMES = rtcan.fragment_count(management.SIZE)
+"""Of a message with all its zeros, as the analysis takes all of them to be."""
 _CLASSES = {
     FrameKind.HRT.value: MessageClass.HRT,
     FrameKind.SRT.value: MessageClass.SRT,
@@ -121,7 +122,7 @@ class ReportedBus(msgspec.Struct):
         measured: dict[str, float] = defaultdict(float)
         for (_, module, kind), rate in self.frames.items():
             if kind == FrameKind.MANAGEMENT.value:
-                measured[module] += rate / _MANAGEMENT_FRAMES
+                measured[module] += rate / MANAGEMENT_FRAMES
         master = next((row.module for row in self.slots if row.topic == SYNC), "")
         rates = control_rates(measured, {module for _, module in self.owners}, master)
         other = max((rate - rates.get(module, 0.0) for module, rate in measured.items()), default=0.0)

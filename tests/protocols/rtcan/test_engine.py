@@ -222,6 +222,11 @@ def test_discovery_that_waits_already_is_not_sent_twice() -> None:
     assert engine.management_waiting == 3
 
 
+def waiting_management(engine: Engine) -> list[management.Management]:
+    payloads = [each.payload for each in engine.transmitter.queue.messages()]
+    return [management.decode(rtcan.unpack_management(each, management.SIZE)) for each in payloads]
+
+
 def test_a_message_of_the_network_replaces_the_one_before_that_still_waits() -> None:
     engine, now = ready_engine()
     sender = engine.management
@@ -231,7 +236,7 @@ def test_a_message_of_the_network_replaces_the_one_before_that_still_waits() -> 
     sender.send(now, management.Reserve(0x050A, 3, 1, 60))
     sender.send(now, management.Grant(0x050B, 1, 1, 60, 5, 1, 7, 3000))
     sender.send(now, management.Refuse(0x050B, 2, 4, 1, 60))
-    waiting = [management.decode(each.payload) for each in engine.transmitter.queue.messages()]
+    waiting = waiting_management(engine)
     assert waiting[1:] == [
         management.Refuse(0x050B, 2, 4, 1, 60),
         management.Reserve(0x060A, 2, 1, 60),
@@ -251,5 +256,5 @@ def test_a_good_bye_stays_behind_what_was_said_before_it() -> None:
     ]
     for message in said:
         engine.manage(now, management.encode(message))
-    waiting = [management.decode(each.payload) for each in engine.transmitter.queue.messages()]
+    waiting = waiting_management(engine)
     assert waiting == [said[0], hello, said[1], leaving]  # the first one has started

@@ -16,6 +16,8 @@ import r2p
 from r2p.analysis.dbc import read_dbc
 from r2p.bus import BusMonitor
 from r2p.msg import Led
+from r2p.protocols.rtcan.cycle import timing
+from r2p.protocols.rtcan.monitor import Monitor
 from r2p.sim import SimCan, run
 from r2p.sim.can import CanNode
 from r2p.sim.transport import SimPort
@@ -23,6 +25,9 @@ from r2p.testing.network import node_in
 from r2p.tools.bus import analyze as analyze_command
 from r2p.tools.bus import app
 from r2p.tools.bus.live import LiveBus, watch
+from r2p.units import MILLISECOND, SECOND
+from tests.protocols.rtcan.test_packed_management import CLAIM, FULL, RENEW
+from tests.protocols.rtcan.test_packed_management import frames as packed_frames
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -277,3 +282,12 @@ def test_a_live_bus_is_measured() -> None:
     assert speed.period == pytest.approx(9_960_000, abs=20_000)
     assert live.supply.share == pytest.approx(58 / 60)
     assert {each.node for each in live.control} <= {"A", "B"}
+
+
+def test_management_is_counted_however_many_frames_a_message_has() -> None:
+    monitor, live = Monitor(timing()), LiveBus(timing(), SECOND)
+    said = [RENEW, CLAIM, FULL, CLAIM]
+    for number, frame in enumerate(frame for data in said for frame in packed_frames(data)):
+        live.see(monitor.frame(frame, number * MILLISECOND))
+    (seen,) = live.messages.values()
+    assert len(seen.begins) == len(said)
