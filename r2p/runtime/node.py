@@ -576,12 +576,15 @@ class Node:
         elif self._reminder is None:
             self._reminder = SpinReminder(self.name, self.log, self.subscribers, self._space)
 
+    def _has_work(self) -> bool:
+        """Return whether there is something to do without a subscription."""
+        periodics = any(isinstance(each, PeriodicPublisher) for each in self.publishers)
+        return bool(self.services or self._sync_hooks or periodics)
+
     async def _arrival(self) -> None:
         """Wait for a message of a subscription with a callback, or for one more of these."""
         subscribers = self._with_callback()
-        periodics = any(isinstance(each, PeriodicPublisher) for each in self.publishers)
-        works = self.services or self._sync_hooks or periodics
-        if not subscribers and not works:
+        if not (subscribers or self._has_work()):
             raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")
         waiter = self._spinning = self._space.loop.create_future()
         try:

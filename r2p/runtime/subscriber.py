@@ -268,8 +268,10 @@ class Subscriber(Generic[T]):
             if message is None:
                 break
             served = True
-            if self.callback is not None and inspect.isawaitable(pending := self.callback(message)):
-                await pending
+            if self.callback is not None:
+                pending = self.callback(message)
+                if pending is not None and inspect.isawaitable(pending):
+                    await pending
             await self._yield_sometimes()
         return served
 
