@@ -114,19 +114,15 @@ class ManagementSender:
         subject, queue = _subject(message), self._transmitter.queue
         queue.withdraw(self._message_id(), lambda each: each.subject == subject)
         floor = REQUEST if isinstance(message, management.Reserve) else SRT_MIN
-        self._enqueue(now, self._message_id(), data, None, CONTROL_DEADLINE, floor, subject)
+        self._enqueue(now, self._message_id(), rtcan.pack_management(data), None, CONTROL_DEADLINE, floor, subject)
 
     def send_bytes(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> None:
         """Send a message; before the others, if it is urgent. One that waits already is not sent twice."""
         if self._detector.profile is not Profile.FIRMWARE:
-            message = self._message_id()
-            if (
-                urgent
-                or handle is not None
-                or not self._transmitter.queue.repeats(message, rtcan.pack_management(data))
-            ):
+            message, packed = self._message_id(), rtcan.pack_management(data)
+            if urgent or handle is not None or not self._transmitter.queue.repeats(message, packed):
                 within, floor = (_URGENT, SRT_MIN) if urgent else (DEADLINE, _floor(data))
-                self._enqueue(now, message, data, handle, within, floor)
+                self._enqueue(now, message, packed, handle, within, floor)
             return
         dropped = self.limiter.put(data, urgent=urgent, handle=handle)
         self._context.report(dropped, Fate.FULL, missed=False, at=now)
@@ -144,23 +140,15 @@ class ManagementSender:
         self,
         now: int,
         message: int,
-        data: bytes,
+        payload: bytes,
         handle: Hashable,
         within: int,
         floor: int = SRT_MIN,
         subject: Hashable = None,
     ) -> None:
-        marked = message != rtcan.FIRMWARE_MANAGEMENT
-        payload = rtcan.pack_management(data) if marked else data
+        marked, deadline = len(payload) < management.SIZE, now + within
         outgoing = QueuedMessage(
-            message,
-            payload,
-            now + within,
-            drop=False,
-            handle=handle,
-            floor=floor,
-            subject=subject,
-            marked=marked and len(payload) < len(data),
+            message, payload, deadline, drop=False, handle=handle, floor=floor, subject=subject, marked=marked
         )
         if self._transmitter.queue.put(outgoing, urgent=floor < DISCOVERY, management=True):
             self._transmitter.reschedule(now)

@@ -176,7 +176,8 @@ class Reassembly:
         buffer.last = stamp
         # Only the last frame may be shorter.
         packed = buffer.packed and buffer.identifier & FIRST_MARK
-        if len(data) != (FRAME_MAX if left else len(data) if packed else buffer.size - buffer.first * FRAME_MAX):
+        last = len(data) if packed else buffer.size - buffer.first * FRAME_MAX
+        if len(data) != (FRAME_MAX if left else last):
             self._reset(buffer, "damaged" if buffer.varies else "wrong length")
             buffer.expected = left  # the rest of it, unless it begins another message
             return self._begin(buffer, frame, left, stamp)

@@ -49,9 +49,9 @@ def start_thread(function: Callable[[], object], name: str) -> threading.Thread:
     return thread
 
 
-def declare(declare: Callable[..., T], received: Callable[[Any], object]) -> T:
-    """Call `declare` with the handler of what it declares: `received` is called with each item, in a thread of its own,
-    which does not keep the program from ending.
+def declare(declaration: Callable[..., T], received: Callable[[Any], object]) -> T:
+    """Make a declaration: call it with the handler of its items. `received` is called with each of them, in a thread of
+    its own, which does not keep the program from ending.
 
     That thread is one of zenoh: it sleeps until there is something, where `recv` of a channel wakes up ten times a
     second, and it takes eight times as many items a second beside a busy event loop. Behind 256 items zenoh waits for
@@ -64,7 +64,7 @@ def declare(declare: Callable[..., T], received: Callable[[Any], object]) -> T:
 
     def run() -> None:
         try:
-            declared.set_result(declare(handler))
+            declared.set_result(declaration(handler))
         except BaseException as error:  # noqa: BLE001 - a panic of zenoh, too: raised where this was called
             declared.set_exception(as_exception(error))
 

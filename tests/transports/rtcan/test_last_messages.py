@@ -43,7 +43,7 @@ async def test_what_the_end_of_a_program_publishes_arrives_before_its_good_bye(
             link = made.link("B")
         assert [Led.decode(each.data).led for each in subscriber.queue] == list(range(messages))
         assert link.stats.sent == messages
-        assert not link.losses
+        assert set(link.losses) <= {"interrupted"}  # A may be saying something when B ends
         assert not made.link("A").losses
 
 
