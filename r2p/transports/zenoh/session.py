@@ -1,6 +1,6 @@
 """One zenoh session, and the way from zenoh's threads into the event loop.
 
-A thread waits at zenoh's channel of each subscriber, and only hands samples to the loop: neither user code nor a
+What zenoh reports arrives in threads, one for each declaration, which only hand it to the loop: neither user code nor a
 protocol runs outside of the loop. Blocking calls (opening, closing) run in a thread, so the loop never waits for a
 network.
 """

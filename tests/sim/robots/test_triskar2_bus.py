@@ -130,9 +130,9 @@ def test_load_does_not_move_hard_real_time_by_a_nanosecond_and_does_move_the_res
     assert without.error >= 5 * loaded.error
 
 
-MANAGEMENT = 390
+MANAGEMENT = 75
 """The most frames per second with which the robot and a PC stay known to each other, once they have met."""
-START = 3200
+START = 1900
 """The most in the first five seconds, in which they meet."""
 
 
