@@ -115,8 +115,7 @@ def fuse(path: str) -> dict[str, float]:
 
 if __name__ == "__main__":
     try:
-        errors = fuse(*sys.argv[1:2] or sys.exit(__doc__))
+        for name, error in fuse(*sys.argv[1:2] or sys.exit(__doc__)).items():
+            print(f"{name:24} {error:6.3f} m")
     except r2p.BagError as reason:
         sys.exit(str(reason))
-    for name, error in errors.items():
-        print(f"{name:24} {error:6.3f} m")

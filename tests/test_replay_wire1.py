@@ -9,7 +9,7 @@ import pytest
 
 import r2p
 from r2p.codecs import management
-from r2p.codecs.management import ManagementType
+from r2p.codecs.management import WIRE_VERSION, ManagementType
 from r2p.msg import Float32, Led, Velocity3
 from r2p.protocols.discovery.events import ModuleGone
 from r2p.testing.network import node_in
@@ -42,7 +42,7 @@ async def test_they_understand_each_other_and_say_that_their_versions_differ(cap
         assert not module.links[0].losses
         assert (await anext(event async for event in events if isinstance(event, ModuleGone))).info.wire == 1
     (warning,) = [text for text in caplog.messages if "wire version" in text]
-    assert "module OLD has wire version 1 (r2p 0.1.0), this one 3" in warning
+    assert f"module OLD has wire version 1 (r2p 0.1.0), this one {WIRE_VERSION}" in warning
 
 
 @pytest.mark.virtual_time

@@ -51,7 +51,7 @@ async def test_rates_loads_and_slots_are_those_of_the_exact_bus() -> None:
     assert (encoder.rate_source, encoder.size, encoder.type) == ("counters", 5, "r2p_msgs/Led")
     assert encoder.rate == pytest.approx(SECOND / CYCLE, rel=2e-3)
     assert encoder.bandwidth == pytest.approx(5 * (encoder.rate or 0.0))
-    assert encoder.laxity is None
+    assert encoder.laxity is None or encoder.laxity > 0.009  # before it has slots, the first one may go as an event
     rows = [each for load in loads for each in load.topics if (each.kind, each.topic) == ("hrt", "encoder")]
     bits = hrt[-1].bits + 3  # with the intermission; all messages are equal
     assert [each.frames for each in rows] == pytest.approx([SECOND / CYCLE] * len(loads), abs=1.0)

@@ -15,6 +15,7 @@ import pytest
 import r2p
 from r2p import keys
 from r2p.codecs import management
+from r2p.codecs.management import WIRE_VERSION
 from r2p.msg import Led
 from r2p.sim.modules import FirmwareModule, Powered, Publishes
 from r2p.tools import doctor
@@ -241,7 +242,7 @@ async def test_a_link_with_modules() -> None:
         asyncio.get_running_loop().call_later(0.1, session.module.links[0].manage, newer, 9)
         assert await findings_of_link(session) == [
             ("connects", True, "after 0.0 s"),
-            ("module", True, f"BOT: r2p {r2p.__version__}, running, wire version 3"),
+            ("module", True, f"BOT: r2p {r2p.__version__}, running, wire version {WIRE_VERSION}"),
             ("module", False, "NEW: r2p 9.9, stopped, wire version 9"),
             ("losses", True, "none"),
         ]

@@ -13,6 +13,7 @@ import pytest
 
 import r2p
 from r2p.codecs import management
+from r2p.codecs.management import WIRE_VERSION
 from r2p.msg import Led, Velocity3
 from r2p.names import module_alias
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
@@ -115,10 +116,11 @@ async def test_versions_are_listed_also_behind_a_gateway(
         await asyncio.sleep(5)
         await list_(session)
         rows = {row["module"]: (row["version"], row["wire"]) for row in printed(capsys)}
-        assert rows == {"ARM": (r2p.__version__, 3), "GW": (r2p.__version__, 3), "NEW": ("9.9", 9)}
+        this = r2p.__version__, WIRE_VERSION
+        assert rows == {"ARM": this, "GW": this, "NEW": ("9.9", 9)}
         monkeypatch.setattr("sys.stdout.isatty", lambda: True)
         await list_(session)
-        assert re.search(r"NEW +running +False +r2p +9.9 +9, not 3 ", capsys.readouterr().out)
+        assert re.search(rf"NEW +running +False +r2p +9.9 +9, not {WIRE_VERSION} ", capsys.readouterr().out)
 
 
 async def test_ages_have_a_unit_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
