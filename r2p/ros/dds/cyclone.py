@@ -413,7 +413,11 @@ _domains: dict[int, _OpenDomain] = {}
 _domains_lock = threading.Lock()
 
 _OWN_CONFIG = "CYCLONEDDS_URI"
-_CONFIG = "<CycloneDDS><Domain><General><Interfaces><NetworkInterface {}/></Interfaces></General></Domain></CycloneDDS>"
+_CONFIG = (
+    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface {}/></Interfaces></General>"
+    # By default a participant is announced each 30 s: where the first time is lost, nobody hears it for so long.
+    "<Discovery><SPDPInterval>2 s</SPDPInterval></Discovery></Domain></CycloneDDS>"
+)
 
 
 def _open_domain(number: int, interface: str) -> Domain:

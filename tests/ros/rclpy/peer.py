@@ -28,8 +28,10 @@ class RclpyPeer:
     """A process of rclpy. `ask` waits for its answer; `event` for what it reports, such as messages that arrived."""
 
     def __init__(self, python: Path, folder: Path) -> None:
-        self.domain = random.SystemRandom().randrange(1, 200)
-        """The ROS_DOMAIN_ID of this run: other runs on this machine have others."""
+        self.domain = random.SystemRandom().randrange(1, 102)
+        """The ROS_DOMAIN_ID of this run: other runs on this machine have others. Ports of higher ones are those that
+        Linux gives to connections.
+        """
         self.environment = {
             **os.environ,
             "ROS_DOMAIN_ID": str(self.domain),
