@@ -1,6 +1,6 @@
 """Modules on a simulated RTCAN bus: until all have their slots and know all topics, and the management afterwards.
 
-All times are of the bus, under virtual time: the same each time. A bus has 254 topics at most, those of 25 modules here.
+All times are of the bus, under virtual time: the same each time. A bus has 254 topics at most: those of 25 modules.
 """
 
 import asyncio

@@ -28,10 +28,8 @@ class RclpyPeer:
     """A process of rclpy. `ask` waits for its answer; `event` for what it reports, such as messages that arrived."""
 
     def __init__(self, python: Path, folder: Path) -> None:
-        self.domain = random.SystemRandom().randrange(1, 102)
-        """The ROS_DOMAIN_ID of this run: other runs on this machine have others. Ports of higher ones are those that
-        Linux gives to connections.
-        """
+        self.domain = random.SystemRandom().randrange(1, 200)
+        """The ROS_DOMAIN_ID of this run: other runs on this machine have others."""
         self.environment = {
             **os.environ,
             "ROS_DOMAIN_ID": str(self.domain),

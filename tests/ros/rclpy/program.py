@@ -346,8 +346,7 @@ def obey(peer: Peer, command: dict[str, Any]) -> None:
 
 def spin(peer: Peer) -> None:
     with contextlib.suppress(ExternalShutdownException):
-        while rclpy.ok():  # on a busy machine, rclpy may miss that a subscription is new, so it looks again
-            peer.executor.spin_once(timeout_sec=0.2)
+        peer.executor.spin()
 
 
 def main() -> None:
