@@ -578,8 +578,7 @@ class Node:
 
     def _has_work(self) -> bool:
         """Return whether there is something to do without a subscription."""
-        periodics = any(isinstance(each, PeriodicPublisher) for each in self.publishers)
-        return bool(self.services or self._sync_hooks or periodics)
+        return bool(self.services or self._sync_hooks) or any(isinstance(p, PeriodicPublisher) for p in self.publishers)
 
     async def _arrival(self) -> None:
         """Wait for a message of a subscription with a callback, or for one more of these."""

@@ -1,4 +1,4 @@
-"""Publishers: the three classes of the thesis (5.3.6), which differ when there is no room.
+"""Publishers of the three classes of the thesis (5.3.6). They differ in what they do when a queue or link is full.
 
     non_real_time   waits for room, at most `stall` seconds, then goes on without the slow subscribers
     sporadic        never waits; a message that is not in every queue and on every link by its deadline is missed

@@ -28,7 +28,7 @@ def attach(channel: str, options: AttachmentOptions | None = None) -> BusAttachm
 
 
 def attach_if_found(channel: str, options: AttachmentOptions) -> BusAttachment | None:
-    """Attach to a bus that another process serves, or that this one has in real time; None if there is none."""
+    """Attach to a bus that another process serves or that runs in real time in this one. Return None if none exists."""
     attachment = connect(channel, options)
     if attachment is None and channel in local_channels():
         return attach(channel, msgspec.structs.replace(options, served=False))

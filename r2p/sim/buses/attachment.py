@@ -182,7 +182,7 @@ class BusAttachment(ABC):
 
     @abstractmethod
     def receive(self, timeout: float | None = None) -> BusFrame | None:
-        """Return the next event; None if there is none in time. `timeout` in seconds, None waits forever.
+        """Wait up to `timeout` seconds (None: forever) for the next event, and return it, or None if none came.
 
         In the thread of the event loop that runs the bus, no frame would arrive while this waits, so a timeout other
         than 0 raises `Error` there if the queue is empty.
@@ -190,7 +190,7 @@ class BusAttachment(ABC):
 
     @abstractmethod
     def set_filters(self, filters: Sequence[BusFilter]) -> None:
-        """Receive frames that pass one of these, from now on; all if there is none. Errors always pass.
+        """From now on, receive only frames that pass one of these filters; without filters, all. Errors always pass.
 
         Raises `MessageError` for more than `FILTERS_MAX`.
         """

@@ -67,7 +67,7 @@ class BusDriver(PluggedNode):
         self._next()
 
     def set_filters(self, filters: Sequence[BusFilter]) -> None:
-        """Deliver frames that pass one of these; all if there is none."""
+        """Deliver only frames that pass one of these filters; without filters, all."""
         self._filters = tuple(filters)
 
     def flush(self) -> None:
@@ -95,7 +95,7 @@ class BusDriver(PluggedNode):
         self.controller.power_on()
 
     def leave(self) -> None:
-        """Leave the bus when the queue is empty, or after a second; nothing is delivered any more."""
+        """Stop delivering frames, and leave the bus once the queue has been sent, or after a second."""
         timeline = self.shared.bus.timeline
         timeline.catch_up()
         self._deliver = self._on_room = ignore

@@ -270,7 +270,7 @@ class LocalAttachment(BusAttachment):
             return False
 
     def _rests_here(self) -> bool:
-        """Return whether this thread ran the loop, and will again, as after `run_until_complete`: nobody else does."""
+        """Return whether the loop is paused between two runs in this thread, as after `run_until_complete`."""
         return threading.get_ident() == self._thread and not self._loop.is_running() and not self._loop.is_closed()
 
     def _soon(self, function: Callable[..., object], *args: Any) -> None:

@@ -64,7 +64,7 @@ class PeriodicMessages(LimitedDurationCyclicSendTaskABC, ModifiableCyclicTaskABC
                 logger.warning("%s; messages of send_periodic are lost, and counted in the task's lost", error)
 
     def _send_or_end(self, count: int, stopped: Callable[[], bool] = lambda: False) -> bool:
-        """Send the `count`-th message. Return False, after a line in the log, if that does not work any more."""
+        """Send the `count`-th message. If the bus no longer takes it, log that and return False."""
         try:
             self._send(count)
         except (can.CanError, ValueError) as error:
