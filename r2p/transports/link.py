@@ -370,7 +370,7 @@ class Link(abc.ABC):
         return None
 
     def translation(self) -> ClockOffset | None:
-        """Return the translation of network time to UTC, and its accuracy; None if unknown."""
+        """Return the translation of network time to UTC and its accuracy, or None while these are unknown."""
         return None
 
     def params(self, topic: str) -> bytes | None:

@@ -48,7 +48,7 @@ def frame_of(message: can.Message) -> AnyFrame:
 
 
 def message_of(event: BusFrame, channel: str) -> can.Message | None:
-    """Return an event as a message; None for what SocketCAN has no message for: the loss of power."""
+    """Return an event as a message, or None for a loss of power, for which SocketCAN has no message."""
     frame = event.frame
     if frame is None:
         return _error_of(event, channel)

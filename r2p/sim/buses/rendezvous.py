@@ -77,7 +77,7 @@ def publish(name: str, port: int, *, bitrate: int) -> Iterator[ServedBus]:
 
 
 def find(name: str) -> ServedBus | None:
-    """Return where the bus of that name is served, or was; None if it is not, or no such bus can be.
+    """Return where the bus of that name is or was served, or None if it is not served or the name can't be one.
 
     Raises TransportError if the folder is not safe.
     """

@@ -43,7 +43,7 @@ _BUFFER: Final = 1 << 16  # bytes read at once
 
 
 def connect(channel: str, options: AttachmentOptions) -> ServedAttachment | None:
-    """Attach to the bus of that name of another process; None if no program serves one.
+    """Attach to the bus of that name in another process. Return None if no program serves one.
 
     Raises TransportError if the server refuses, as for another bit rate, or does not answer.
     """

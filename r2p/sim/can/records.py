@@ -51,7 +51,7 @@ class Latency(msgspec.Struct, frozen=True):
             )
 
     def sampler(self, numbers: random.Random) -> Callable[[], int] | None:
-        """A function that returns one random delay after the other, in ns; None if all are `nominal`."""
+        """Return a function that draws a random delay (ns), or None if all delays are `nominal`."""
         if not self.jitter:
             return None
         shortest, span, draw = self.nominal - self.jitter, 2 * self.jitter + 1, numbers.random

@@ -346,7 +346,7 @@ class EmulatedLoader:
         return msgspec.structs.replace(addresses, bssadr=bssadr, dataadr=dataadr)
 
     def _reserve(self, length: int) -> int | None:
-        """Hand out RAM; None if there is too little. No RAM has the address 0."""
+        """Reserve RAM and return its address, 0 for an app without RAM. Return None if too little is free."""
         if not length:
             return 0
         length = -(-length // self.memory.ram_align) * self.memory.ram_align

@@ -63,7 +63,7 @@ def echo(world: World, source: Beam, receiver: Beam, edges: float = 1.0) -> floa
 
 
 def _reflections(wall: Wall, source: Beam, receiver: Beam) -> Iterator[tuple[Point, float]]:
-    """Return the point at which a wall mirrors the sound, and half the length of its way; nothing if it does not."""
+    """Return the point at which a wall mirrors the sound, and half the length of its way, if it does."""
     (ax, ay), (bx, by) = wall
     length = math.hypot(bx - ax, by - ay)
     if not length:
