@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
 import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
@@ -28,19 +29,20 @@ FRAME = Frame(10 << 23 | 0x0242 << 7, b"abc")
 
 
 @contextlib.asynccontextmanager
-async def program(*command: str) -> AsyncIterator[None]:
+async def program(*command: str, end: signal.Signals = signal.SIGKILL) -> AsyncIterator[None]:
+    """Run it inside of the block. SIGTERM is for what has to clean up: socat overlooks one just before its select()."""
     process = await asyncio.create_subprocess_exec(*command)
     try:
         yield
     finally:
-        process.terminate()
+        process.send_signal(end)
         await process.wait()
 
 
 @contextlib.asynccontextmanager
 async def adapter(device: str) -> AsyncIterator[str]:
     """Make a CAN interface of a serial device, and set it up."""
-    async with program("slcand", "-F", "-o", "-s8", device, "slcan0"):
+    async with program("slcand", "-F", "-o", "-s8", device, "slcan0", end=signal.SIGTERM):
         await until(lambda: netlink.find_interface("slcan0"))
         ip("set", "slcan0", "up")
         yield "slcan0"
