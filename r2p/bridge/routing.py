@@ -314,7 +314,8 @@ class RoutingTable:
     def _type_on(self, topic: str, ports: Iterable[BridgePort], role: int) -> TopicType | None:
         """Return the first announced type on these links."""
         infos = (each.link.discovery.topics.get(self._policy.to_link_name(topic, each.name)) for each in ports)
-        return next((info.types[role] for info in infos if info is not None and role in info.types), None)
+        types = (info.type_of(role) for info in infos if info is not None)
+        return next((each for each in types if each is not None), None)
 
     # One topic on one link
 

@@ -233,7 +233,7 @@ class RosDiscovery(DiscoveryProtocol):
 
     def publisher_type(self, topic: str, module: str) -> TopicType:
         info = self.topics.get(topic)
-        return TopicType() if info is None else info.types.get(ROLE_PUBLISHES, TopicType())
+        return (info.publisher_type if info is not None else None) or TopicType()
 
     # The link
 

@@ -71,7 +71,7 @@ def _type_of_layout(layout: Layout[Any]) -> TopicType:
 
 def refused_publishers(topic: Topic, info: TopicInfo | None) -> str | None:
     """Describe how the type of the publishers at the other end of a link differs from this module's, if it does."""
-    ours, theirs = asked_type(topic), info.types.get(ROLE_PUBLISHES) if info is not None and info.mismatch else None
+    ours, theirs = asked_type(topic), info.publisher_type if info is not None and info.mismatch else None
     return None if theirs is None or ours.fits(theirs) else describe_mismatch(ROLE_PUBLISHES, ours, theirs)
 
 

@@ -39,9 +39,10 @@ class TopicInfo(msgspec.Struct, gc=False):
     """A topic on the link. Instants are in monotonic ns, None: never; `size` is in bytes, 0: unknown, a bound if the
     length `varies`.
 
-    `types` has the type that the peers in each role (ROLE_...) announce, and `typed_at` the time of the last one.
-    These and `fingerprint` are those of the publishers, or of the subscribers while publishers have said nothing.
-    `type_name` is what ROS nodes call the type, `package/Name`; empty on other links.
+    `publisher_type` and `subscriber_type` are what the peers in these roles announce, and `..._typed_at` is when they
+    said so last, NEVER: they did not. `size`, `varies` and `fingerprint` are those of the publishers, or of the
+    subscribers while publishers have said nothing. `type_name` is what ROS nodes call the type, `package/Name`; empty
+    on other links.
     """
 
     name: str
@@ -52,8 +53,14 @@ class TopicInfo(msgspec.Struct, gc=False):
     requested_at: int | None = None
     mismatch: bool = False
     type_name: str = ""
-    types: dict[int, TopicType] = {}
-    typed_at: dict[int, int] = {}
+    publisher_type: TopicType | None = None
+    subscriber_type: TopicType | None = None
+    publisher_typed_at: int = NEVER
+    subscriber_typed_at: int = NEVER
+
+    def type_of(self, role: int) -> TopicType | None:
+        """Return the type that the peers in this role announce."""
+        return self.publisher_type if role == ROLE_PUBLISHES else self.subscriber_type
 
     def set_heard(self, role: int, at: int | None) -> None:
         """Set the time of the last message from a peer in this role."""
@@ -64,13 +71,24 @@ class TopicInfo(msgspec.Struct, gc=False):
 
     def set_type(self, role: int, known: TopicType | None) -> None:
         """Set the type that the peers in this role announce; None removes it."""
-        if known is None:
-            self.types.pop(role, None)
+        if role == ROLE_PUBLISHES:
+            self.publisher_type = known
         else:
-            self.types[role] = known
-        best = self.types.get(ROLE_PUBLISHES) or self.types.get(ROLE_SUBSCRIBES, TopicType())
+            self.subscriber_type = known
+        best = self.publisher_type or self.subscriber_type or _UNKNOWN
         self.size, self.varies = best.size, best.varies
         self.fingerprint = None if best.fingerprint == management.ANY_TYPE else best.fingerprint
+
+    def set_typed(self, role: int, at: int) -> None:
+        """Set when the peers in this role said their type last."""
+        if role == ROLE_PUBLISHES:
+            self.publisher_typed_at = at
+        else:
+            self.subscriber_typed_at = at
+
+    def is_typed(self, role: int, at: int) -> bool:
+        """Return whether a peer in this role said its type at this very instant."""
+        return at == (self.publisher_typed_at if role == ROLE_PUBLISHES else self.subscriber_typed_at)
 
 
 class EndpointInfo(msgspec.Struct, frozen=True, gc=False):
@@ -219,7 +237,10 @@ class Directory:
         if before is not None and before.instance is not None and before.instance != info.instance:
             self._forget_instance(before.instance)  # the endpoints of its last start are gone
         self.generation += before is None or before.differs(info)
-        forgotten = self._put(self.modules, info.name, info, "modules forgotten")
+        self.modules.pop(info.name, None)  # to enter it as the last one again
+        full = len(self.modules) >= self.most
+        forgotten = self._pop_first(self.modules, "modules forgotten") if full else None
+        self.modules[info.name] = info
         self._forget_direct(before)
         self._forget_direct(forgotten)
         self._enter_direct(info)
@@ -265,50 +286,70 @@ class Directory:
 
     def touch_topic(self, name: str) -> TopicInfo:
         """Return the entry of a topic that a message has just named."""
-        info = self.topics.get(name) or TopicInfo(name)
-        self._put(self.topics, name, info, "topics forgotten")
+        topics = self.topics
+        info = topics.pop(name, None)  # to enter it as the last one again
+        if info is None:
+            info = TopicInfo(name)
+            if len(topics) >= self.most:
+                self._pop_first(topics, "topics forgotten")
+        topics[name] = info
         return info
+
+    def add_size(self, now: int, topic: str, role: int, size: int) -> TopicInfo:
+        """Enter the size field from a peer, whose type came just before, mostly, and says more."""
+        info = self.topics.get(topic)
+        known = info.type_of(role) if info is not None and info.is_typed(role, now) else None
+        if info is not None and known is not None and known.size_field == size:
+            return info
+        return self.add_type(now, topic, role, TopicType.announced(size))
 
     def add_type(self, now: int, topic: str, role: int, said: TopicType) -> TopicInfo:
         """Enter the type from a peer. Of several different ones the first stays, as long as it is repeated."""
         info = self.touch_topic(topic)
-        if info.typed_at and now > min(info.typed_at.values()) + LEASE:
-            for each in [each for each, at in info.typed_at.items() if now > at + LEASE]:
-                if each == role or not self.has_addresses:  # what is said once lasts until another one is said
-                    del info.typed_at[each]
-                    info.set_type(each, None)
-        known = info.types.get(role, _UNKNOWN)
-        if said == known and role in info.typed_at:  # as almost always
-            info.typed_at[role] = now
-        elif known is _UNKNOWN and said != _UNKNOWN:
-            info.typed_at[role] = now
+        oldest = now - LEASE
+        if info.publisher_typed_at < oldest or info.subscriber_typed_at < oldest:
+            self._forget_types(info, role, oldest)
+        known = info.type_of(role)
+        if said == known:  # as almost always
+            info.set_typed(role, now)
+        elif said == _UNKNOWN:
+            pass
+        elif known is None:
+            info.set_typed(role, now)
             info.set_type(role, said)
-        elif said != _UNKNOWN and not known.covers(said) and known.fits(said):
+        elif not known.covers(said) and known.fits(said):
             if known.fingerprint in {management.ANY_TYPE, said.fingerprint}:
-                info.typed_at[role] = now
+                info.set_typed(role, now)
             info.set_type(role, known.merged(said))
         return info
 
+    def _forget_types(self, info: TopicInfo, said: int, oldest: int) -> None:
+        """Forget types that were last announced before `oldest` (ns), as one in the role `said` is announced."""
+        for role, at in ((ROLE_PUBLISHES, info.publisher_typed_at), (ROLE_SUBSCRIBES, info.subscriber_typed_at)):
+            if at < oldest and (role == said or not self.has_addresses):  # what is said once lasts until the next one
+                info.set_typed(role, NEVER)
+                info.set_type(role, None)
+
     def enter_endpoint(self, now: int, message: management.Endpoint) -> None:
         """Enter a publisher or subscriber of a remote node, or forget it if it is gone."""
-        role = message.role & ~management.ROLE_GONE
-        key = (message.instance, message.node, message.topic, role)
-        if message.role & management.ROLE_GONE:
-            self.forget_endpoint(key)
+        instance, node, topic, role = message.instance, message.node, message.topic, message.role
+        if role & management.ROLE_GONE:
+            self.forget_endpoint((instance, node, topic, role & ~management.ROLE_GONE))
             return
-        module = self.name_of(message.instance)
-        self._keep_endpoint(
-            now, EndpointInfo(module, message.instance, message.node, message.topic, role, message.publisher_class)
-        )
+        module = self._names.get(instance, "")
+        self._keep_endpoint(now, EndpointInfo(module, instance, node, topic, role, message.publisher_class))
 
     def _keep_endpoint(self, now: int, info: EndpointInfo) -> None:
         key = (info.instance, info.node, info.topic, info.role)
-        self.generation += self.endpoints.get(key) != info
-        self._ends[info.topic, info.role] += key not in self.endpoints
-        old = self._put(self.endpoints, key, info, "endpoints forgotten")
-        self._endpoints_of.setdefault(info.instance, {})[key] = None
-        if old is not None:
-            self._drop_endpoint((old.instance, old.node, old.topic, old.role))
+        before = self.endpoints.pop(key, None)  # to enter it as the last one again
+        self.generation += before != info
+        if before is None:
+            self._ends[info.topic, info.role] += 1
+            self._endpoints_of.setdefault(info.instance, {})[key] = None
+            if len(self.endpoints) >= self.most:
+                old = self._pop_first(self.endpoints, "endpoints forgotten")
+                self._drop_endpoint((old.instance, old.node, old.topic, old.role))
+        self.endpoints[key] = info
         self._start_lease(now, key, self.modules.get(info.module))
 
     def _start_lease(self, now: int, key: EndpointKey, module: ModuleInfo | None) -> None:
@@ -350,21 +391,17 @@ class Directory:
         self.timers.clear(("endpoint", key))
         instance, _, topic, role = key
         if decrement(self._ends, (topic, role)) and self.has_addresses and (info := self.topics.get(topic)):
-            info.typed_at.pop(role, None)  # the next type is said once, too
+            info.set_typed(role, NEVER)  # the next type is said once, too
             info.set_type(role, None)
         keys = self._endpoints_of[instance]
         del keys[key]
         if not keys:
             del self._endpoints_of[instance]
 
-    def _put(self, table: dict[K, V], key: K, value: V, reason: str) -> V | None:
-        """Enter a value as the latest one; return the one that was forgotten for it. A dict keeps the order."""
-        table.pop(key, None)  # to enter it as the last one again
-        forgotten = None
-        if len(table) >= self.most:
-            forgotten = table.pop(next(iter(table)))
-            self.note_forgotten(reason)
-        table[key] = value
+    def _pop_first(self, table: dict[K, V], reason: str) -> V:
+        """Make room: forget, and return, the entry that was not repeated for longest. A dict keeps the order."""
+        forgotten = table.pop(next(iter(table)))
+        self.note_forgotten(reason)
         return forgotten
 
     def note_forgotten(self, reason: str) -> None:
@@ -379,7 +416,10 @@ class Directory:
             self._direct.setdefault(info.source, {})[info.name] = info
             self._others += not info.knows_crowds
             if info.r2p:
-                self._leases.setdefault(info.source, Counter())[topic_lease(info)] += 1
+                leases = self._leases.get(info.source)
+                if leases is None:  # a Counter made in vain takes as long as all the rest
+                    leases = self._leases[info.source] = Counter()
+                leases[topic_lease(info)] += 1
 
     def _forget_direct(self, info: ModuleInfo | None) -> None:
         if info is None or info.hops:

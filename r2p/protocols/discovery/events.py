@@ -6,9 +6,9 @@ which has one other end.
 """
 
 import enum
+import functools
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
-from typing import Self
 
 import msgspec
 
@@ -46,11 +46,12 @@ class TopicType(msgspec.Struct, frozen=True, gc=False):
     varies: bool = False
     accepted: tuple["TopicType", ...] = ()
 
-    @classmethod
-    def announced(cls, size: int, fingerprint: bytes = management.ANY_TYPE) -> Self:
-        """Return the type in a management message with this size field."""
+    @staticmethod
+    @functools.lru_cache(maxsize=1024)
+    def announced(size: int, fingerprint: bytes = management.ANY_TYPE) -> "TopicType":
+        """Return the type in a management message with this size field. It is cached, as messages are repeated."""
         bound, varies = management.decode_size(size)
-        return cls(bound, fingerprint, varies)
+        return TopicType(bound, fingerprint, varies)
 
     @property
     def size_field(self) -> int:
@@ -115,8 +116,10 @@ class ModuleInfo(msgspec.Struct, frozen=True, gc=False):
         return self.r2p and self.wire >= management.WIRE_CROWD
 
     def differs(self, other: "ModuleInfo") -> bool:
-        """Return whether anything but the time of the last message differs."""
-        return msgspec.structs.replace(other, last_heard=self.last_heard) != self
+        """Return whether anything differs but the time of the last message, and the lease, which follows the number of
+        modules.
+        """
+        return msgspec.structs.replace(other, last_heard=self.last_heard, lease=self.lease) != self
 
 
 def possible_senders(modules: Iterable[ModuleInfo]) -> set[str]:

@@ -116,7 +116,7 @@ class SubscriptionNegotiation:
     def advertised(self, now: int, message: management.Advertise, source: PeerAddress) -> None:
         """Handle ADVERTISE of a publisher: request its messages if this module subscribes to the topic."""
         topic = message.topic
-        self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType.announced(message.size)).advertised_at = now
+        self._directory.add_size(now, topic, ROLE_PUBLISHES, message.size).advertised_at = now
         own = self._own.topics[ROLE_SUBSCRIBES].get(topic)
         peer = self._get_or_create(source) if own is not None else None
         if own is None or peer is None:
@@ -129,7 +129,7 @@ class SubscriptionNegotiation:
     def requested(self, now: int, message: management.SubscribeRequest, source: PeerAddress) -> None:
         """Handle SUBSCRIBE_REQUEST of a subscriber: respond, and attach it if it is new. Its size is ignored."""
         topic = message.topic
-        self._directory.add_type(now, topic, ROLE_SUBSCRIBES, TopicType.announced(message.size)).requested_at = now
+        self._directory.add_size(now, topic, ROLE_SUBSCRIBES, message.size).requested_at = now
         own = self._own.topics[ROLE_PUBLISHES].get(topic)
         peer = self._get_or_create(source) if own is not None else None
         if own is None or peer is None:
@@ -144,7 +144,7 @@ class SubscriptionNegotiation:
         peer = self._get_or_create(source) if topic in self._own.topics[ROLE_SUBSCRIBES] else None
         if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, message)):
             return
-        self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType.announced(message.size))
+        self._directory.add_size(now, topic, ROLE_PUBLISHES, message.size)
         # Every response to a repeated request arrives here; only new params, as after a restart, are an event.
         if peer.publishers.get(topic) != (message.params, message.size):
             self._own.publisher_counts[topic] += topic not in peer.publishers

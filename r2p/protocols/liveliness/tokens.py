@@ -213,7 +213,7 @@ class Matching:
         if info is None:
             info = self.topics[token.topic] = TopicInfo(token.topic)
         info.set_heard(token.role, now)
-        known = info.types.get(token.role)
+        known = info.type_of(token.role)
         if known is None:  # nobody has declared a type before
             own = _type_of({key: token})
             if own != TopicType():

@@ -127,7 +127,7 @@ def _other_type(session: Session, topic: str, cls: type[r2p.Message], role: int)
     """Describe the type that the peers in a role have, if it is another one."""
     for link in session.module.links:
         info = link.discovery.topics.get(topic)
-        theirs = info.types.get(role) if info is not None and info.mismatch and link.up else None
+        theirs = info.type_of(role) if info is not None and info.mismatch and link.up else None
         if theirs is not None:
             verb = "carries" if role == ROLE_PUBLISHES else "is subscribed as"
             what = f"{topic} {verb}"
