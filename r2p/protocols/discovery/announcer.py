@@ -339,10 +339,11 @@ class Announcer:
     # The messages
 
     def hello(self, flags: int = 0) -> management.Hello:
-        """Return this module's HELLO. Its lease outlasts two lost rounds of repetition."""
+        """Return this module's HELLO. Its lease outlasts two lost rounds, or a late one where nothing is lost."""
         flags |= management.HELLO_TOOL if self._observer else 0
         flags |= management.HELLO_GATEWAY if self.is_gateway else 0
-        lease = min(max(LEASE, 3 * self._schedule.round_time), FOR_EVER) // MILLISECOND
+        rounds = 2 if self._directory.has_addresses else 3
+        lease = min(max(LEASE, rounds * self._schedule.round_time), FOR_EVER) // MILLISECOND
         release = __version__[: management.RELEASE_MAX]
         return management.Hello(self.module, self.instance, flags, 0, lease, management.WIRE_VERSION, release)
 

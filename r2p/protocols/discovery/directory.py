@@ -143,7 +143,7 @@ class Directory:
         self.has_addresses = False
         """Whether the link can send to one module alone, and loses nothing."""
         self._direct: dict[PeerAddress, dict[str, ModuleInfo]] = {}
-        self._leases: dict[PeerAddress, Counter[int]] = {}
+        self._leases: dict[PeerAddress, dict[int, int]] = {}  # how many modules have each
         self._names: dict[int, str] = {}
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
         self._ends: Counter[_TopicRole] = Counter()  # endpoints of each topic and role
@@ -416,10 +416,8 @@ class Directory:
             self._direct.setdefault(info.source, {})[info.name] = info
             self._others += not info.knows_crowds
             if info.r2p:
-                leases = self._leases.get(info.source)
-                if leases is None:  # a Counter made in vain takes as long as all the rest
-                    leases = self._leases[info.source] = Counter()
-                leases[topic_lease(info)] += 1
+                leases, lease = self._leases.setdefault(info.source, {}), topic_lease(info)
+                leases[lease] = leases.get(lease, 0) + 1
 
     def _forget_direct(self, info: ModuleInfo | None) -> None:
         if info is None or info.hops:
@@ -457,7 +455,7 @@ def counterpart(role: int) -> int:
     return ROLE_SUBSCRIBES if role == ROLE_PUBLISHES else ROLE_PUBLISHES
 
 
-def decrement(counter: Counter[K], key: K) -> bool:
+def decrement(counter: dict[K, int], key: K) -> bool:
     """Count one less of a key, and remove it with the last one; return whether this was the last one."""
     counter[key] -= 1
     if counter[key]:

@@ -32,10 +32,10 @@ _LOSSLESS_ROUNDS = 2 * CROWD_ROUNDS
 """The same on networks that lose nothing, where newcomers are answered one by one."""
 _TOGETHER = 16
 """The most items that one step repeats on such networks."""
-_PRESENCE_MODULES = 30
-_LOSSLESS_MODULES = 20
-_PRESENCE_MAX = 10
+_MODULES_A_ROUND, _ROUNDS_MAX = 30, 10
 """For each so many modules, a round takes as long as another one, up to so many."""
+_LOSSLESS_MODULES_A_ROUND, _LOSSLESS_ROUNDS_MAX = 10, 20
+"""The same on networks that lose nothing: two rounds fit into the longest lease."""
 _PRESENCE_INTERVAL = SECOND // 10
 """Ns between two presences (HELLO and ALIVE), at least, however many modules ask."""
 _PRESENCE_EACH = SECOND // 100
@@ -325,8 +325,10 @@ class Schedule:
     @property
     def _crowd_round(self) -> int:
         """Ns in which a module of a crowd repeats its presence, and what it says in every round."""
-        each = _LOSSLESS_MODULES if self._lossless else _PRESENCE_MODULES
-        return _ROUND * min(max(1, self._crowd // each), _PRESENCE_MAX)
+        each, most = _MODULES_A_ROUND, _ROUNDS_MAX
+        if self._lossless:
+            each, most = _LOSSLESS_MODULES_A_ROUND, _LOSSLESS_ROUNDS_MAX
+        return _ROUND * min(max(1, self._crowd // each), most)
 
     def _repeat(self, now: int) -> None:
         self._repeated_at, self._repeat_at, self._tool_waits = now, None, False
