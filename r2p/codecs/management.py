@@ -60,7 +60,7 @@ from r2p.codecs._records import Codec, Record
 from r2p.codecs.keys import Challenge as Challenge
 from r2p.codecs.keys import Proof as Proof
 from r2p.codecs.keys import Seal as Seal
-from r2p.errors import DecodeError, MessageError
+from r2p.errors import MessageError
 
 SIZE = 32
 """Bytes of a message."""
@@ -512,21 +512,6 @@ def _decode(data: bytes) -> Management:
         if message.role & ~gone not in _ROLES:
             raise UnknownType(f"role {message.role} of {type(message).__name__}")
     return message
-
-
-@functools.lru_cache(maxsize=1024)
-def split_topics(messages: tuple[bytes, ...]) -> tuple[tuple[bytes, ...], tuple[Management, ...]]:
-    """Return the first of several messages that came together, and those about topics behind them, decoded.
-
-    It is cached, as `decode` is.
-    """
-    first = next((n for n, data in enumerate(messages) if type_of(data) in TOPIC_TYPES), len(messages))
-    if not all(type_of(data) in TOPIC_TYPES for data in messages[first:]):
-        return messages, ()
-    try:
-        return messages[:first], tuple(map(decode, messages[first:]))
-    except (DecodeError, UnknownType):
-        return messages, ()
 
 
 def type_of(data: bytes) -> int:

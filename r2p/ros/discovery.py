@@ -14,7 +14,8 @@ from r2p.codecs.management import CLASS_LATCHES, NO_PARAMS, QUEUE, ROLE_GONE, RO
 from r2p.names import name_hash
 from r2p.protocols.discovery.aliases import LinkNames
 from r2p.protocols.discovery.announcer import LocalTopic, Relayed
-from r2p.protocols.discovery.directory import FOR_EVER, TABLE_MAX, Demand, EndpointInfo, TopicInfo
+from r2p.protocols.discovery.demand import Demand
+from r2p.protocols.discovery.directory import FOR_EVER, TABLE_MAX, EndpointInfo, TopicInfo
 from r2p.protocols.discovery.events import (
     Event,
     ModuleChanged,
@@ -27,7 +28,7 @@ from r2p.protocols.discovery.events import (
     SubscribersGone,
     TopicType,
 )
-from r2p.protocols.discovery.session import DiscoveryProtocol
+from r2p.protocols.discovery.interface import DiscoveryProtocol
 from r2p.ros.graph_names import GraphNames
 from r2p.ros.middleware import RosGraph, RosPeerEndpoint
 from r2p.units import SECOND

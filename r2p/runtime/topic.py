@@ -16,7 +16,7 @@ from r2p.errors import TransportError, TypeMismatch
 from r2p.log_lines import NodeLogger
 from r2p.messages import Layout
 from r2p.protocols.discovery.events import TopicType
-from r2p.protocols.discovery.session import DiscoveryProtocol
+from r2p.protocols.discovery.interface import DiscoveryProtocol
 from r2p.runtime.accepting import AcceptedTypes
 from r2p.runtime.backpressure import Sink, WaitQueue
 from r2p.runtime.network_time import NetworkClock

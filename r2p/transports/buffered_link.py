@@ -20,7 +20,8 @@ from r2p.errors import DecodeError
 from r2p.names import CALLS, LOG, MANAGEMENT, REPLIES
 from r2p.protocols.call_parts import CallAssembler
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, SubscriberJoined, possible_senders
-from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
+from r2p.protocols.discovery.interface import DiscoveryProtocol
+from r2p.protocols.discovery.session import Discovery
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import Sample, Source
 from r2p.runtime.topic import PublisherHandle, Topic

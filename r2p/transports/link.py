@@ -36,7 +36,8 @@ from r2p.protocols.discovery.events import (
     SubscribersGone,
     possible_senders,
 )
-from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
+from r2p.protocols.discovery.interface import DiscoveryProtocol
+from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.keys import LinkEnd
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.network_time import NetworkClock

@@ -15,12 +15,13 @@ from typing import Any, ClassVar, cast
 import msgspec
 
 from r2p.clock import check_seconds, in_background, random_of
-from r2p.codecs import management, own_services
+from r2p.codecs import own_services
 from r2p.errors import TransportError
 from r2p.keys import SharedKey
 from r2p.messages import SIZE_MAX, ClockOffset
 from r2p.names import MANAGEMENT
 from r2p.protocols.discovery.session import Discovery
+from r2p.protocols.discovery.topic_batch import split_topics
 from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import DirectedSample, PublisherClass, Sample, Source
 from r2p.transports.buffered_link import BufferedLink
@@ -371,14 +372,15 @@ class MemoryLink(BufferedLink):
 
     def _manage_together(self, messages: tuple[bytes, ...], source: int) -> None:
         """Handle management messages that came together; what they cause comes after the last one."""
-        first, topics = (messages, ()) if self.guard is not None else management.split_topics(messages)
+        first, topics = (messages, None) if self.guard is not None else split_topics(messages)
         acting, self._acting = self._acting, True
         try:
             for data in first:
                 self.stats.lost.guard(self.manage, data, source)
         finally:
             self._acting = acting
-        self._apply(self._discovery.receive_topics(self._clock.monotonic(), topics, source) if topics else ())
+        now = self._clock.monotonic()
+        self._apply(self._discovery.receive_topics(now, topics, source) if topics is not None else ())
 
     def sample(self, topic: str, arrival: Datagram) -> Sample:
         self.stats.bytes_received += len(arrival.data)

@@ -10,14 +10,14 @@ A subscription of firmware lasts for ever. That of an r2p peer (its HELLO came w
 After a good-bye a peer counts as r2p until its lease would be over, because earlier messages may still arrive.
 """
 
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.management import ANSWERED, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic
-from r2p.protocols.discovery.directory import LEASE, Directory, LeasedDemand, counterpart, decrement, topic_lease
+from r2p.protocols.discovery.directory import LEASE, Directory, counterpart, decrement, topic_lease
 from r2p.protocols.discovery.events import (
     Mismatched,
     ModuleInfo,
@@ -29,6 +29,9 @@ from r2p.protocols.discovery.events import (
     TopicType,
 )
 from r2p.units import MILLISECOND, NEVER, SECOND
+
+if TYPE_CHECKING:
+    from r2p.protocols.discovery.demand import LeasedDemand
 
 M = TypeVar("M", management.Advertise, management.SubscribeRequest)
 

@@ -28,13 +28,13 @@ CROWD = 5
 """Other modules on the link from which on topics are repeated in the slow ring, if all of them know that."""
 CROWD_ROUNDS = 14
 """The most turns of the ring in which the slow ring turns once, reached with as many modules."""
-_LOSSLESS_ROUNDS = 2 * CROWD_ROUNDS
-"""The same on networks that lose nothing, where newcomers are answered one by one."""
+_LOSSLESS_ROUNDS = CROWD_ROUNDS * 3 // 2
+"""The same on networks that lose nothing, where newcomers are answered one by one: less than topics last there."""
 _TOGETHER = 16
 """The most items that one step repeats on such networks."""
-_MODULES_A_ROUND, _ROUNDS_MAX = 30, 10
+_ROUND_MODULES, _ROUND_MAX = 30, 10
 """For each so many modules, a round takes as long as another one, up to so many."""
-_LOSSLESS_MODULES_A_ROUND, _LOSSLESS_ROUNDS_MAX = 10, 20
+_LOSSLESS_ROUND_MODULES, _LOSSLESS_ROUND_MAX = 10, 20
 """The same on networks that lose nothing: two rounds fit into the longest lease."""
 _PRESENCE_INTERVAL = SECOND // 10
 """Ns between two presences (HELLO and ALIVE), at least, however many modules ask."""
@@ -325,9 +325,9 @@ class Schedule:
     @property
     def _crowd_round(self) -> int:
         """Ns in which a module of a crowd repeats its presence, and what it says in every round."""
-        each, most = _MODULES_A_ROUND, _ROUNDS_MAX
+        each, most = _ROUND_MODULES, _ROUND_MAX
         if self._lossless:
-            each, most = _LOSSLESS_MODULES_A_ROUND, _LOSSLESS_ROUNDS_MAX
+            each, most = _LOSSLESS_ROUND_MODULES, _LOSSLESS_ROUND_MAX
         return _ROUND * min(max(1, self._crowd // each), most)
 
     def _repeat(self, now: int) -> None:

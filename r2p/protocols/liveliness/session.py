@@ -16,7 +16,8 @@ from r2p.codecs.liveliness import ModuleToken, SoftwareToken, TopicToken
 from r2p.names import module_alias
 from r2p.protocols.discovery.aliases import LinkNames, ModuleAliases
 from r2p.protocols.discovery.announcer import LocalTopic, Relayed
-from r2p.protocols.discovery.directory import Demand, decrement
+from r2p.protocols.discovery.demand import Demand
+from r2p.protocols.discovery.directory import decrement
 from r2p.protocols.discovery.events import (
     Event,
     ModuleInfo,
@@ -25,7 +26,7 @@ from r2p.protocols.discovery.events import (
     QueryTokens,
     TopicType,
 )
-from r2p.protocols.discovery.session import DiscoveryProtocol
+from r2p.protocols.discovery.interface import DiscoveryProtocol
 from r2p.protocols.liveliness.modules import ModuleRegistry
 from r2p.protocols.liveliness.tokens import Matching, TokenSet
 from r2p.units import SECOND

@@ -18,7 +18,8 @@ from r2p.codecs import liveliness, management
 from r2p.codecs.liveliness import ModuleToken, SoftwareToken, TopicToken
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.discovery.announcer import LocalTopic
-from r2p.protocols.discovery.directory import Demand, TopicInfo, counterpart, decrement
+from r2p.protocols.discovery.demand import Demand
+from r2p.protocols.discovery.directory import TopicInfo, counterpart, decrement
 from r2p.protocols.discovery.events import (
     Declare,
     Mismatched,
