@@ -21,6 +21,7 @@ import rclpy
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -345,8 +346,11 @@ def obey(peer: Peer, command: dict[str, Any]) -> None:
 
 
 def spin(peer: Peer) -> None:
+    """Run the callbacks. The executor breaks off where a node ends just as it begins to wait for it."""
     with contextlib.suppress(ExternalShutdownException):
-        peer.executor.spin()
+        while rclpy.ok():
+            with contextlib.suppress(InvalidHandle):
+                peer.executor.spin()
 
 
 def main() -> None:

@@ -41,7 +41,7 @@ def load(name: str) -> type[r2p.Message]:
 
 
 async def arrival(peer: RclpyPeer, topic: str, publish: Callable[[], object]) -> Event:
-    """Publish until a message arrives: beside busy programs, Fast DDS sometimes gets none of the first ones."""
+    """Publish until a message arrives: the subscriber may not know of the publisher yet that has found it."""
     arriving = asyncio.create_task(peer.event(topic=topic))
     while not arriving.done():
         publish()
