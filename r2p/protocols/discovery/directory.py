@@ -4,7 +4,6 @@ Every table is bounded. A full one forgets the entry that was not repeated for l
 messages pushes out true entries only until they are repeated.
 """
 
-import copy
 from collections import Counter
 from collections.abc import Callable
 from typing import TypeVar
@@ -79,7 +78,7 @@ class TopicInfo(msgspec.Struct, gc=False):
 
     def heard(self, now: int) -> "TopicInfo":
         """Return this entry as one of which everything has been heard now."""
-        info = copy.copy(self)
+        info = msgspec.structs.replace(self)
         if info.advertised_at is not None:
             info.advertised_at = now
         if info.requested_at is not None:
@@ -235,8 +234,7 @@ class Directory:
 
     def refresh(self, now: int, info: ModuleInfo) -> None:
         """Note that a module lives of which nothing has changed."""
-        fresh = copy.copy(info)
-        msgspec.structs.force_setattr(fresh, "last_heard", now)
+        fresh = msgspec.structs.replace(info, last_heard=now)
         del self.modules[info.name]  # to enter it as the last one again
         self.modules[info.name] = fresh
         if not info.hops:
