@@ -1,7 +1,8 @@
 """The types of services of other nodes. The master does not know them: each server is asked once, as `rosservice` does.
 
-A server answers the header of a probe with its own one. Servers are asked one after the other, and the graph is
-reported again when all are known. One that does not answer is asked again RETRY_S later, while it is in the graph.
+A server answers the header of a probe with its own one. Each is asked as soon as it is in the graph, so that one that
+hangs, or was killed and stays with the master, keeps no other waiting. One that does not answer is asked again RETRY_S
+later, while it is in the graph.
 """
 
 import asyncio
@@ -18,6 +19,9 @@ PROBE_S = 2.0
 
 RETRY_S = 10.0
 """Seconds until a server is asked again that has not answered."""
+
+AT_ONCE = 16
+"""Servers that are asked at a time."""
 
 _OF_EACH_NODE = {
     "get_loggers": RosService("roscpp/GetLoggers", "32e97e85527d4678a8f9279894bb64b0"),
@@ -36,52 +40,49 @@ class ServiceProbes:
         self._context = context
         self._probe = probe
         self._changed = changed
-        self._types: dict[RosPeerServer, RosService | None] = {}
-        """The types by server; None while one is asked for, or to be asked."""
-        self._asking: asyncio.Task[None] | None = None
-        self._retry: asyncio.TimerHandle | None = None
+        self._types: dict[RosPeerServer, RosService] = {}
+        self._asking: dict[RosPeerServer, asyncio.Task[None]] = {}
+        self._turns = asyncio.Semaphore(AT_ONCE)
 
     def complete(self, graph: RosGraph) -> RosGraph:
         """Return the graph with the types that are known, and ask for the others."""
         for gone in self._types.keys() - graph.servers:
             del self._types[gone]
-        for server in graph.servers - self._types.keys():
-            self._types[server] = _OF_EACH_NODE.get(server.service.rpartition("/")[2])
-        if self._asking is None and self._retry is None and None in self._types.values():
-            self._asking = asyncio.get_running_loop().create_task(self._ask())
+        for gone in self._asking.keys() - graph.servers:
+            self._asking.pop(gone).cancel()
+        for server in graph.servers - self._types.keys() - self._asking.keys():
+            kind = _OF_EACH_NODE.get(server.service.rpartition("/")[2])
+            if kind is not None:
+                self._types[server] = kind
+            else:
+                self._asking[server] = asyncio.get_running_loop().create_task(self._ask(server))
         return msgspec.structs.replace(graph, servers=frozenset(map(self._typed, graph.servers)))
 
     def close(self) -> None:
         """Ask no more."""
-        if self._asking is not None:
-            self._asking.cancel()
-        if self._retry is not None:
-            self._retry.cancel()
+        for task in self._asking.values():
+            task.cancel()
+        self._asking.clear()
 
     def _typed(self, server: RosPeerServer) -> RosPeerServer:
-        kind = self._types[server]
+        kind = self._types.get(server)
         if kind is None:
             return server
         return msgspec.structs.replace(server, type=kind.name, checksum=kind.checksum)
 
-    async def _ask(self) -> None:
-        answered = False
-        for server in [server for server, kind in self._types.items() if kind is None]:
+    async def _ask(self, server: RosPeerServer) -> None:
+        while (kind := await self._answer(server.service)) is None:  # noqa: ASYNC110 - only the server knows
+            await asyncio.sleep(RETRY_S)
+        self._types[server] = kind
+        del self._asking[server]
+        self._changed()
+
+    async def _answer(self, service: str) -> RosService | None:
+        """Return the type that the server of a service says; None, and counted, if it says none."""
+        async with self._turns:
             try:
                 async with asyncio.timeout(PROBE_S):
-                    kind = await self._probe(server.service)
+                    return await self._probe(service)
             except (NoServer, ServiceError, TimeoutError):
                 self._context.lost["probe of a service unanswered"] += 1
-            else:
-                if server in self._types:  # else it is gone meanwhile
-                    self._types[server] = kind
-                    answered = True
-        self._asking = None
-        if None in self._types.values():
-            self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._ask_again)
-        if answered:
-            self._changed()
-
-    def _ask_again(self) -> None:
-        self._retry = None
-        self._changed()
+                return None
