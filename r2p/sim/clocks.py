@@ -84,10 +84,10 @@ class PacedClock(VirtualClock):
 
 
 class FollowingClock(PacedClock):
-    """The time of another clock, such as that of a simulator of ROS; real time while there is none.
+    """A clock that follows another one, such as that of a ROS simulator. Without one, it shows real time.
 
-    Between two times it stands still. When the other clock goes back, or far ahead, this one takes its time from there
-    on: no timer goes off for the time that is left out.
+    Between two readings it stands still. When the other clock jumps back, or far ahead, this one jumps with it: timers
+    do not fire for the time that was skipped.
     """
 
     def __init__(self, real: Callable[[], int] = _SYSTEM.monotonic) -> None:

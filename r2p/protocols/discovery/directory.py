@@ -76,8 +76,8 @@ class TopicInfo(msgspec.Struct, gc=False):
         self.size, self.varies = best.size, best.varies
         self.fingerprint = None if best.fingerprint == management.ANY_TYPE else best.fingerprint
 
-    def heard(self, now: int) -> "TopicInfo":
-        """Return this entry as one of which everything has been heard now."""
+    def as_of(self, now: int) -> "TopicInfo":
+        """Return a copy of this entry in which all that was heard was heard at `now` (monotonic ns)."""
         info = msgspec.structs.replace(self)
         if info.advertised_at is not None:
             info.advertised_at = now
@@ -305,7 +305,7 @@ class Directory:
         return info
 
     def add_size(self, now: int, topic: str, role: int, size: int) -> TopicInfo:
-        """Enter the size field from a peer, whose type came just before, mostly, and says more."""
+        """Enter the size field from a peer. Usually its type came just before, and says more than the size."""
         info = self.topics.get(topic)
         known = info.type_of(role) if info is not None and info.is_typed(role, now) else None
         if info is not None and known is not None and known.size_field == size:
@@ -345,13 +345,13 @@ class Directory:
         if role & management.ROLE_GONE:
             self.forget_endpoint((instance, node, topic, role & ~management.ROLE_GONE))
             return
-        module = self._names.get(instance, "")
+        module = self.name_of(instance)
         self._keep_endpoint(now, EndpointInfo(module, instance, node, topic, role, message.publisher_class))
 
     def enter_endpoints(self, instance: int, entries_of: Callable[[str], dict[EndpointKey, EndpointInfo]]) -> bool:
-        """Enter the endpoints of a module, as `entries_of` its name has them, if all are new and need no leases.
+        """Enter endpoints of a module, if all of them are new and need no leases; return whether they were entered.
 
-        Return whether they were entered.
+        `entries_of` makes the entries, given the name of the module.
         """
         module = self.modules.get(self.name_of(instance))
         if module is None or module.hops or not self.is_lossless:

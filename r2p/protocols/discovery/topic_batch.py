@@ -1,8 +1,8 @@
 """Announcements of topics that came together, worked out once for all modules of this process that receive them.
 
-On a network in memory the same messages reach a hundred modules, and what they say is new to most, and none of their
-business: each of these enters copies of the same entries. So the start of n modules does not take n times as long for
-each topic.
+On a network in memory, the same messages reach a hundred modules. To most of them, the topics are new and of no further
+interest, so each of these modules enters copies of the same entries. Without that, every message would be handled again
+by every module.
 """
 
 import functools
@@ -30,7 +30,7 @@ class TopicBatch:
         """The module with the endpoints."""
         self.endpoints: list[management.Endpoint] = []
         self.rest = messages
-        """Messages that are not worked out: all, if any of them says more than that something is there."""
+        """Messages to handle one by one: all of them, if any says more than that a topic or an endpoint is there."""
         self._entries: dict[EndpointKey, EndpointInfo] = {}
         self._module = ""
         self._work_out()
@@ -38,7 +38,10 @@ class TopicBatch:
     def enter_new(
         self, now: int, directory: Directory, own: Mapping[int, Mapping[str, object]]
     ) -> Sequence[management.Management]:
-        """Enter what is new, but for topics of the module's `own`, by role; return the messages about the rest."""
+        """Enter what is new, and return the other messages: those about known topics, and about this module's `own`.
+
+        `own` are its topics by role (ROLE_...), `now` is in monotonic ns.
+        """
         rest = list(self.rest)
         topics, published, subscribed = directory.topics, own[ROLE_PUBLISHES], own[ROLE_SUBSCRIBES]
         room = len(self.topics) <= directory.most - len(topics)
@@ -46,13 +49,13 @@ class TopicBatch:
             if name in topics or name in published or name in subscribed or not room:
                 rest += self.about[name]
             else:
-                topics[name] = entry.heard(now)
+                topics[name] = entry.as_of(now)
         if self.endpoints and not directory.enter_endpoints(self.instance, self.endpoint_entries):
             rest += self.endpoints
         return rest
 
     def endpoint_entries(self, module: str) -> dict[EndpointKey, EndpointInfo]:
-        """Return the entries of endpoints, if this is the name of their module."""
+        """Return the entries of the endpoints, given the name of their module."""
         if module != self._module:
             infos = [
                 EndpointInfo(module, each.instance, each.node, each.topic, each.role, each.publisher_class)
@@ -88,7 +91,7 @@ class TopicBatch:
 
 @functools.lru_cache(maxsize=1024)
 def split_topics(messages: tuple[bytes, ...]) -> tuple[tuple[bytes, ...], TopicBatch | None]:
-    """Return the first of several messages that came together, and those about topics behind them."""
+    """Split messages that came together into the first ones, and those about topics that follow; None without any."""
     first = next((n for n, data in enumerate(messages) if management.type_of(data) in TOPIC_TYPES), len(messages))
     if first == len(messages) or not all(management.type_of(data) in TOPIC_TYPES for data in messages[first:]):
         return messages, None

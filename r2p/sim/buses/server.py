@@ -167,7 +167,7 @@ class ServedClient(asyncio.Protocol):
         self._transport.abort()
 
     def refuse(self, reason: str) -> None:
-        """End the connection of a program that is none of r2p, or does not keep to the protocol."""
+        """Close the connection of a program that does not speak r2p's protocol, or breaks its rules."""
         self._server.note_refused(reason)
         self._leave()
         self._transport.abort()

@@ -481,7 +481,7 @@ class CanBus(BusWire):
         self.timeline.at(end, self._over, transfer, bits, kind, end)
 
     def _overhear(self, transfer: _Transfer) -> None:
-        """Let controllers that only listen receive a frame that nobody acknowledged, as the error flag is invisible."""
+        """Deliver an unacknowledged frame to controllers that only listen: they do not see the error flag."""
         reception = Reception(self.timeline, transfer.frame, self.timeline.now())
         for node in transfer.silent:
             if node.concerned(wire_identifier(transfer.frame)):
@@ -553,7 +553,7 @@ class CanBus(BusWire):
             self._dominate()
 
     def _extend(self, transfer: _Transfer, error: ErrorKind, flags_end: int) -> None:
-        """Let the delimiter of an error frame begin only when the bus is no longer stuck."""
+        """Delay the delimiter of an error frame until the bus is no longer stuck."""
         bits = -((transfer.start - self._stuck_until) // self.bit) + DELIMITER
         end = transfer.start + bits * self.bit
         self.timeline.at(end, self._over, transfer, bits, error, end)

@@ -501,7 +501,10 @@ class ControllerMailboxes:
         return frames
 
     def remove(self, request: TransmitRequest) -> bool:
-        """Empty the mailbox of this request. False: it is no longer there, or the node babbles and sends it again."""
+        """Remove a request from its mailbox.
+
+        Return False if it is no longer there, or if the node babbles, and so sends it again.
+        """
         mailbox = request.mailbox
         if mailbox == _BABBLE or self.requests.get(mailbox) is not request:
             return False

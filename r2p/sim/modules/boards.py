@@ -141,7 +141,7 @@ class Board(r2p.Module):
             await super().__aexit__(kind, error, trace)
 
     async def stop(self) -> None:
-        """End nodes and apps, as `r2p.Module` does. In boot mode, the board then obeys no command any more."""
+        """Stop nodes and apps, as `r2p.Module` does. A board in boot mode ignores all commands from then on."""
         if self.boot.in_boot_mode and not self.boot.fault:
             with contextlib.closing(self._new_node(NODE)) as node:
                 self.boot.halt(node, "STOP in boot mode: its management hangs until its power is cut")

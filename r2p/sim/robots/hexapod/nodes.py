@@ -113,7 +113,7 @@ async def gait(node: r2p.Node, body: LegSpec = BODY, spec: GaitSpec = GaitSpec()
 
 
 def limited(command: Velocity3, homes: list[Triple], top: float) -> Velocity3:
-    """Return a command with which no foot is faster than `top` m/s; one of almost nothing is none."""
+    """Return the command, scaled down so that no foot is faster than `top` m/s; tiny commands become zero."""
     fastest = max(math.hypot(command.x - command.w * y, command.y + command.w * x) for x, y, _ in homes)
     if fastest < _MOVING:
         return Velocity3()
