@@ -10,7 +10,7 @@ have one layout, `std_msgs/Float32` and `r2p_msgs/Float32`: of a topic on ROS, t
 import asyncio
 import contextlib
 import difflib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import r2p
@@ -312,15 +312,15 @@ def describe_other(
     return f"{what} messages of {shown}, but {name} has {has}: give the right --type{suggestion(exact)}"
 
 
-async def _announced(session: Session, topic: str) -> r2p.TopicView:
-    """Return what is announced of a topic; wait a little for it, because a busy gateway answers late and in parts."""
+async def announced(session: Session, topic: str, enough: Callable[[r2p.TopicView], bool]) -> r2p.TopicView:
+    """Return what is announced of a topic; wait a little for it, because a busy gateway announces late and in parts."""
 
     def view() -> r2p.TopicView:
         return session.module.network.topics().get(topic, r2p.TopicView(topic))
 
     if session.settings.via:
         with session.waiting(f"the type of {topic}"):
-            await wait_until(lambda: view().size > 0 or view().varies, _ANNOUNCED)
+            await wait_until(lambda: enough(view()), _ANNOUNCED)
     return view()
 
 
@@ -331,7 +331,7 @@ async def find(session: Session, topic: str, given: str | None) -> type[r2p.Mess
     if stated is not None:
         return stated
     await session.settle()
-    view = await _announced(session, topic)
+    view = await announced(session, topic, lambda view: view.size > 0 or view.varies)
     found = await types.learn(session, view)
     if found is None:
         exact = 0 if view.varies else view.size

@@ -14,7 +14,7 @@ from r2p.tools.session import REPORT_WAITING_AFTER, Session, UsageError, patienc
 from r2p.tools.topic.filter import FilterError
 from r2p.tools.topic.selection import Content, Fields, FilterText, Full, Meta, Selection, as_hex, filter_for, form_of
 from r2p.tools.topic.watching import Topics, TypeName, advice, received_samples, while_publishers_fit
-from r2p.tools.types import Types, suggestion
+from r2p.tools.types import Types, announced, suggestion
 from r2p.units import SECOND
 
 QUEUE = 1024
@@ -171,10 +171,12 @@ class _TopicReader:
             return None
 
     async def _look_up_type(self, sample: r2p.Sample) -> None:
-        """Look up the type that the peer announces, at most once a second."""
+        """Look up the type that the peer announces, at most once a second; modules other than firmware will do so."""
         now = self._session.node.now()
         if now < self._next_look_up:
             return
+        if not (self._reported or self._session.announcements.may_have_firmware()):
+            await announced(self._session, self.topic, lambda view: view.fingerprint is not None)
         self._next_look_up = now + SECOND
         await self._learn()
         if self._cls is None and not self._reported:

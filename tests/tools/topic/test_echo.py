@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import pytest
 
 import r2p
+from r2p.codecs.management import ROLE_PUBLISHES, TypeInfo
 from r2p.msg import GatewayStatus, Header, LaserScan, Led, StampedPose3, Velocity3
 from r2p.tools.session import TimedOut, UsageError
 from r2p.tools.topic.echo import QUEUE, echo
@@ -291,6 +292,23 @@ async def test_firmware_tells_no_type(capsys: pytest.CaptureFixture[str]) -> Non
         loop.call_later(0.2, imu.publish, "leds", Led(led=3, value=1).encode())
         await echo(session, ["leds"], once=True, type="Led")
     assert printed(capsys) == [{"data": "0300000001"}, {"led": 3, "value": 1}]
+
+
+@pytest.mark.virtual_time
+async def test_messages_wait_for_a_type_that_is_announced_late(capsys: pytest.CaptureFixture[str]) -> None:
+    typed, led = r2p.layout(Led), Led(led=3, value=1).encode()
+    async with robot(), tool() as session:
+        late = Firmware()  # which says nothing of itself, as modules behind a busy gateway
+        loop = asyncio.get_running_loop()
+        loop.call_later(1.0, late.advertise, "leds", 5)
+        for n in range(3):
+            loop.call_later(1.5 + n / 10, late.publish, "leds", led)
+        loop.call_later(2.0, late.send, TypeInfo(ROLE_PUBLISHES, "leds", typed.fingerprint, typed.size))
+        loop.call_later(2.0, late.advertise, "leds", 5)
+        await echo(session, ["leds"], count=3)
+    captured = capsys.readouterr()
+    assert captured.out == '{"led": 3, "value": 1}\n' * 3
+    assert "unknown" not in captured.err
 
 
 @pytest.mark.virtual_time
