@@ -19,7 +19,8 @@ from r2p.transports.announcement import NOTHING, Announcement, GatewayHooks
 from r2p.transports.link import Link
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
-_TYPES = {ManagementType.ALIVE, ManagementType.HELLO, *management.GATEWAY_TYPES}
+_PROBE = ord("_")
+"""The first byte of an ALIVE that is a probe."""
 _ALL: frozenset[int] = frozenset()
 """Topics that all links can carry."""
 
@@ -31,6 +32,8 @@ class MultihomedModule:
         self.selection = LinkSelection(instance)
         self._space = space
         self._instance = instance
+        self._own_instance = instance.to_bytes(4, "little")
+        self._own_name = space.module.encode()
         self._notify = notify
         self._ports: dict[str, _MultihomedPort] = {}
         """Ports by the name of the link."""
@@ -87,7 +90,7 @@ class MultihomedModule:
 
     def handle_management(self, port: "_MultihomedPort", data: bytes) -> bool:
         """Handle a management message; return True if discovery need not see it."""
-        if management.type_of(data) not in _TYPES:
+        if not self._may_concern_links(data):
             return False
         try:
             message = management.decode(data)
@@ -97,6 +100,15 @@ class MultihomedModule:
         if is_for_us:
             self._act()
         return is_for_us
+
+    def _may_concern_links(self, data: bytes) -> bool:
+        """Return whether a message may say something about the links; hardly any does, and all are asked."""
+        kind = management.type_of(data)
+        if kind == ManagementType.ALIVE:
+            return data[0] == _PROBE or self._own_name in data
+        if kind == ManagementType.HELLO:
+            return self._own_instance in data
+        return kind in management.GATEWAY_TYPES
 
     def _select(self, now: int, number: int, message: management.Management, data: bytes) -> bool:
         """Enter what a message shows about the links; return False for a message about something else."""

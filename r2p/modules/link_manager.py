@@ -471,7 +471,7 @@ class LinkManager:
 
     def _suspect_conflict(self, link: Link, info: ModuleInfo) -> None:
         """Check again a while after a name was heard on two links: the module may be moving from one to the other."""
-        if info.name in self._suspected:
+        if info.name in self._suspected or len(self.links) < 2:
             return
         others = (other for each, other in self._same_name(link, info.name) if each is not link)
         if any(other.instance != info.instance for other in others):

@@ -82,7 +82,7 @@ def multicast() -> tuple[str, int] | None:
 @pytest.fixture(scope="module")
 def robot() -> Iterator[Robot]:
     group, port = multicast() or ("", 0)
-    bus = f"rtcan:udp_multicast:{group},slots=20,cycle=20ms" if group else ""
+    bus = f"rtcan:udp_multicast:{group},slots=50,cycle=100ms" if group else ""
     links = ["--via", "tcp-listen:0,gateways=yes", *(["--via", bus] if bus else [])]
     with contextlib.ExitStack() as stack:
         # To one port Linux brings the packets of all groups, those of other tests, too.

@@ -112,6 +112,8 @@ class Announcer:
         schedule.is_settled = self._is_settled
         self._hello_in = 0
         """Presences until the next HELLO in a crowd."""
+        self._said_lease = 0
+        """The lease in the last HELLO to all (ms)."""
 
     # The module's topics
 
@@ -216,7 +218,6 @@ class Announcer:
             starts = range(0, max(len(items), 1), _ANSWERS_AT_ONCE)
             self._answer = [self._part(items[at : at + _ANSWERS_AT_ONCE]) for at in starts]
         self._answers[source] = deque(self._answer)
-        self._hello_in = 0  # with more modules, rounds may take longer: the others learn the new lease in time
 
     @property
     def has_answers(self) -> bool:
@@ -342,10 +343,14 @@ class Announcer:
         """Return this module's HELLO. Its lease outlasts two lost rounds, or a late one where nothing is lost."""
         flags |= management.HELLO_TOOL if self._observer else 0
         flags |= management.HELLO_GATEWAY if self.is_gateway else 0
-        rounds = 2 if self._directory.has_addresses else 3
-        lease = min(max(LEASE, rounds * self._schedule.round_time), FOR_EVER) // MILLISECOND
         release = __version__[: management.RELEASE_MAX]
-        return management.Hello(self.module, self.instance, flags, 0, lease, management.WIRE_VERSION, release)
+        return management.Hello(self.module, self.instance, flags, 0, self._lease, management.WIRE_VERSION, release)
+
+    @property
+    def _lease(self) -> int:
+        """The time that this module may be silent (ms). Rounds take longer the more modules there are."""
+        rounds = 2 if self._directory.has_addresses else 3
+        return min(max(LEASE, rounds * self._schedule.round_time), FOR_EVER) // MILLISECOND
 
     def requests(self, topic: str, own: LocalTopic, size: int = 0) -> list[management.Management]:
         """Return the request for a topic with this announced size field (0: unknown), if it may be sent.
@@ -408,8 +413,11 @@ class Announcer:
 
     def _is_known(self) -> bool:
         """Return whether an ALIVE is enough this time: in a crowd, which would take it for firmware if it were new."""
-        if self._observer or not self._directory.crowd or self._hello_in <= 0:
-            self._hello_in = (_HELLO_EACH_TOLD if self._directory.has_addresses else _HELLO_EACH) - 1
+        alone = self._directory.has_addresses  # newcomers are answered alone: the others don't learn a longer lease
+        changed = alone and self._lease != self._said_lease
+        if self._observer or not self._directory.crowd or self._hello_in <= 0 or changed:
+            self._hello_in = (_HELLO_EACH_TOLD if alone else _HELLO_EACH) - 1
+            self._said_lease = self._lease
             return False
         self._hello_in -= 1
         return True

@@ -5,7 +5,7 @@ messages pushes out true entries only until they are repeated.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import msgspec
@@ -27,7 +27,7 @@ FOR_EVER = management.LEASE_MS_MAX * MILLISECOND
 """The longest lease of a HELLO (ns): its subscriptions last as long as the module does."""
 
 _UNKNOWN = TopicType()
-_TopicRole = tuple[str, int]
+TopicRole = tuple[str, int]
 K = TypeVar("K")
 V = TypeVar("V")
 
@@ -156,7 +156,7 @@ class Directory:
         self._leases: dict[PeerAddress, dict[int, int]] = {}  # how many modules have each
         self._names: dict[int, str] = {}
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
-        self._ends: Counter[_TopicRole] = Counter()  # endpoints of each topic and role
+        self._ends: dict[TopicRole, int] = {}  # how many endpoints each topic has in each role
         self._starts: dict[str, _Starts] = {}
         self._emit = emit
         self._said_full = False
@@ -225,20 +225,24 @@ class Directory:
             instance=message.instance,
             observer=bool(message.flags & management.HELLO_TOOL),
             gateway=bool(message.flags & management.HELLO_GATEWAY),
-            lease=max(LEASE, message.lease_ms * MILLISECOND),
+            lease=lease_in(message),
             hops=message.hops,
             source=source,
             wire=message.wire,
             release=message.release,
         )
 
-    def refresh(self, now: int, info: ModuleInfo) -> None:
-        """Note that a module lives of which nothing has changed."""
-        fresh = msgspec.structs.replace(info, last_heard=now)
+    def refresh(self, now: int, info: ModuleInfo, lease: int) -> ModuleInfo:
+        """Note that a module lives of which nothing but its lease may have changed (ns); return its new entry."""
+        fresh = msgspec.structs.replace(info, last_heard=now, lease=lease)
         del self.modules[info.name]  # to enter it as the last one again
         self.modules[info.name] = fresh
-        if not info.hops:
+        if lease != info.lease:
+            self._forget_direct(info)
+            self._enter_direct(fresh)
+        elif not info.hops:
             self._direct[info.source][info.name] = fresh
+        return fresh
 
     def enter(self, info: ModuleInfo) -> ModuleInfo | None:
         """Enter a module; return the one that was forgotten for it, if the table was full."""
@@ -348,10 +352,15 @@ class Directory:
         module = self.name_of(instance)
         self._keep_endpoint(now, EndpointInfo(module, instance, node, topic, role, message.publisher_class))
 
-    def enter_endpoints(self, instance: int, entries_of: Callable[[str], dict[EndpointKey, EndpointInfo]]) -> bool:
+    def enter_endpoints(
+        self,
+        instance: int,
+        ends: Sequence[TopicRole],
+        entries_of: Callable[[str], dict[EndpointKey, EndpointInfo]],
+    ) -> bool:
         """Enter endpoints of a module, if all of them are new and need no leases; return whether they were entered.
 
-        `entries_of` makes the entries, given the name of the module.
+        `ends` are the topic and the role of each, `entries_of` makes the entries, given the name of the module.
         """
         module = self.modules.get(self.name_of(instance))
         if module is None or module.hops or not self.is_lossless:
@@ -361,7 +370,8 @@ class Directory:
             return False
         self.endpoints.update(entries)
         self._endpoints_of.setdefault(instance, {}).update(dict.fromkeys(entries))
-        self._ends.update((topic, role) for _, _, topic, role in entries)
+        for each in ends:
+            self._ends[each] = self._ends.get(each, 0) + 1
         self.generation += len(entries)
         return True
 
@@ -370,7 +380,8 @@ class Directory:
         before = self.endpoints.pop(key, None)  # to enter it as the last one again
         self.generation += before != info
         if before is None:
-            self._ends[info.topic, info.role] += 1
+            end = info.topic, info.role
+            self._ends[end] = self._ends.get(end, 0) + 1
             self._endpoints_of.setdefault(info.instance, {})[key] = None
             if len(self.endpoints) >= self.most:
                 old = self._pop_first(self.endpoints, "endpoints forgotten")
@@ -467,6 +478,11 @@ class Directory:
         self._names.pop(instance, None)
         for key in list(self._endpoints_of.get(instance, ())):
             self.forget_endpoint(key)
+
+
+def lease_in(message: management.Hello) -> int:
+    """Return how long an r2p module may be silent after this HELLO (ns)."""
+    return max(LEASE, message.lease_ms * MILLISECOND)
 
 
 def topic_lease(info: ModuleInfo) -> int:

@@ -115,6 +115,18 @@ class ModuleInfo(msgspec.Struct, frozen=True, gc=False):
         """Whether it may repeat its topics slowly, and keeps those of others that do."""
         return self.r2p and self.wire >= management.WIRE_CROWD
 
+    def is_repeated_by(self, hello: management.Hello, source: PeerAddress) -> bool:
+        """Return whether a HELLO from this address says the same as this entry, but for the lease, and asks nothing."""
+        flags = management.HELLO_TOOL * self.observer | management.HELLO_GATEWAY * self.gateway
+        return (
+            self.instance == hello.instance
+            and flags == hello.flags
+            and self.hops == hello.hops
+            and self.source == source
+            and self.wire == hello.wire
+            and self.release == hello.release
+        )
+
     def differs(self, other: "ModuleInfo") -> bool:
         """Return whether anything differs but the time of the last message, and the lease, which follows the number of
         modules.

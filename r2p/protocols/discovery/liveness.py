@@ -12,7 +12,7 @@ from r2p.codecs import management
 from r2p.names import module_alias
 from r2p.protocols.discovery.aliases import ModuleAliases
 from r2p.protocols.discovery.announcer import Announcer
-from r2p.protocols.discovery.directory import Directory
+from r2p.protocols.discovery.directory import Directory, lease_in
 from r2p.protocols.discovery.events import (
     KIND_MODULE,
     AliasConflict,
@@ -78,8 +78,7 @@ class PeerLiveness:
         """Handle ALIVE: the state of any module."""
         known = self._directory.modules.get(message.module)
         if known is not None and known.flags == message.flags and self._is_settled(known):
-            self._directory.refresh(now, known)
-            self._timers.set(("module", known.name), now + known.lease)
+            self._heard_again(now, known, known.lease)
             return
         if not self._is_possible(message.module):
             return
@@ -99,6 +98,11 @@ class PeerLiveness:
 
     def hello(self, now: int, message: management.Hello, source: PeerAddress) -> None:
         """Handle HELLO: an r2p module, maybe this one."""
+        known = self._directory.modules.get(message.module)
+        if known is not None and known.is_repeated_by(message, source) and self._is_settled(known):
+            info = self._heard_again(now, known, lease_in(message))
+            self._negotiation.module_found(now, info, is_new=False)
+            return
         if not self._is_possible(message.module):
             return
         is_alias = bool(message.flags & management.HELLO_ALIAS)
@@ -253,6 +257,11 @@ class PeerLiveness:
         if forgotten is not None and forgotten.r2p:
             self._remove(now, forgotten)
         self._announcer.update_r2p()
+
+    def _heard_again(self, now: int, info: ModuleInfo, lease: int) -> ModuleInfo:
+        """Renew the lease of a module that only shows that it lives; return its new information."""
+        self._timers.set(("module", info.name), now + lease)
+        return self._directory.refresh(now, info, lease)
 
     def _remove(self, now: int, info: ModuleInfo, *, silent: bool = False) -> None:
         self._directory.remove(info)

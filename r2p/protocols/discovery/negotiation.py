@@ -50,7 +50,7 @@ PEERS_MAX = 4096
 """Peers on one link."""
 
 
-class Peer(msgspec.Struct, eq=False):
+class Peer(msgspec.Struct, eq=False, gc=False):
     """One address on the link.
 
     `direct` are the r2p modules there, by name; a line with more than two ends has several at one address. `lease` is
@@ -64,12 +64,12 @@ class Peer(msgspec.Struct, eq=False):
     """
 
     source: PeerAddress
-    direct: set[str] = msgspec.field(default_factory=set)
+    direct: dict[str, None] = msgspec.field(default_factory=dict)
     r2p_until: int = 0
     lease: int | None = None
     subscriptions: dict[str, bool] = msgspec.field(default_factory=dict)
     joined_at: dict[str, int] = msgspec.field(default_factory=dict)
-    permanent: set[str] = msgspec.field(default_factory=set)
+    permanent: dict[str, None] = msgspec.field(default_factory=dict)
     waiting: dict[str, SubscriberJoined] = msgspec.field(default_factory=dict)
     publishers: dict[str, tuple[bytes, int]] = msgspec.field(default_factory=dict)
     types: dict[tuple[str, int], TopicType] = msgspec.field(default_factory=dict)
@@ -86,7 +86,7 @@ class Peer(msgspec.Struct, eq=False):
         if shared and lease is not None:  # the longest lease counts, and that only ends with them all
             lease = max(lease, self.lease) if self.lease is not None else None
         self.lease = lease
-        self.direct.add(info.name)
+        self.direct[info.name] = None
         self.r2p_until = max(self.r2p_until, now + info.lease)
 
     def mark_restarted(self) -> None:
@@ -171,7 +171,7 @@ class SubscriptionNegotiation:
         the others may still subscribe.
         """
         peer = self._peers.get(source)
-        if peer is not None and peer.direct == {self._directory.name_of(message.instance)}:
+        if peer is not None and peer.direct.keys() == {self._directory.name_of(message.instance)}:
             self._remove_subscriber(peer, message.topic)
         else:
             self._counts["unsubscribe left to the lease"] += 1
@@ -325,7 +325,7 @@ class SubscriptionNegotiation:
         """Note that a module left its address. With the last r2p module there, all subscriptions and publishers end."""
         peer = self._peers.get(info.source)
         if peer is not None and info.name in peer.direct:
-            peer.direct.discard(info.name)
+            del peer.direct[info.name]
             if not peer.direct:
                 self._forget_peer(now, peer)
 
@@ -449,10 +449,10 @@ class SubscriptionNegotiation:
         """Extend a subscription that was made or repeated: by a lease for r2p peers, for ever for firmware."""
         key = ("lease", peer.source, topic)
         if not peer.is_r2p(now):
-            peer.permanent.add(topic)
+            peer.permanent[topic] = None
             self._timers.clear(key)
             return
-        peer.permanent.discard(topic)
+        peer.permanent.pop(topic, None)
         if peer.lease is not None:  # else the end of its module ends it
             self._timers.set(key, self._directory.lease_end(now, peer.source, peer.lease))
 
@@ -470,7 +470,7 @@ class SubscriptionNegotiation:
             self._timers.clear(("grace", peer.source, topic))
         if peer.subscriptions.pop(topic, None) is None:
             return
-        peer.permanent.discard(topic)
+        peer.permanent.pop(topic, None)
         del peer.joined_at[topic]
         if decrement(self._own.subscriber_counts, topic) and topic in self._attached:
             self._attached.remove(topic)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from r2p.codecs import UnknownType, management
 from r2p.codecs.management import ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES, TOPIC_TYPES
 from r2p.errors import DecodeError
-from r2p.protocols.discovery.directory import Directory, EndpointInfo, EndpointKey, TopicInfo
+from r2p.protocols.discovery.directory import Directory, EndpointInfo, EndpointKey, TopicInfo, TopicRole
 from r2p.protocols.discovery.events import TopicType
 from r2p.protocols.timers import KeyedTimers
 
@@ -29,6 +29,8 @@ class TopicBatch:
         self.instance = 0
         """The module with the endpoints."""
         self.endpoints: list[management.Endpoint] = []
+        self.ends: list[TopicRole] = []
+        """The topic and the role of each endpoint."""
         self.rest = messages
         """Messages to handle one by one: all of them, if any says more than that a topic or an endpoint is there."""
         self._entries: dict[EndpointKey, EndpointInfo] = {}
@@ -50,7 +52,7 @@ class TopicBatch:
                 rest += self.about[name]
             else:
                 topics[name] = entry.as_of(now)
-        if self.endpoints and not directory.enter_endpoints(self.instance, self.endpoint_entries):
+        if self.endpoints and not directory.enter_endpoints(self.instance, self.ends, self.endpoint_entries):
             rest += self.endpoints
         return rest
 
@@ -87,6 +89,7 @@ class TopicBatch:
         if len(instances) <= 1:
             self.topics, self.about, self.endpoints, self.rest = tables.topics, about, endpoints, ()
             self.instance = next(iter(instances), 0)
+            self.ends = [(each.topic, each.role) for each in endpoints]
 
 
 @functools.lru_cache(maxsize=1024)
