@@ -205,6 +205,14 @@ class Bridge:
             return False
         return self._is_own(port, message) or self._receive_presence(port, message, data)
 
+    def modules_changed(self, port: BridgePort) -> None:
+        """Pass on what discovery has learnt on a link, and let a client in that has no other link."""
+        modules = port.link.discovery.modules.values()
+        if port.is_client and any(info.sole_link and not (info.hops or info.gateway) for info in modules):
+            self.tree.clients.admit(self._clock.monotonic(), port.tree_port)
+            self._act()
+        self.directory.changed(port)
+
     def order_refused(self, link: Link, order: management.Order, reason: int) -> None:
         """Refuse an order that came without the link's key (DENIED_...)."""
         self._orders.refuse(self.ports[link.name], order, reason)
@@ -383,7 +391,7 @@ class _PortHooks(GatewayHooks):
         generation = self._port.link.discovery.generation
         if generation != self._generation:
             self._generation = generation
-            self._bridge.directory.changed(self._port)
+            self._bridge.modules_changed(self._port)
 
 
 def _port_statistics(port: BridgePort) -> PortStatistics:

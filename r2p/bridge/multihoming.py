@@ -26,15 +26,26 @@ _ALL: frozenset[int] = frozenset()
 
 
 class MultihomedModule:
-    """The links of one module. `notify(link, kind, text, trouble)` is called with news for the user."""
+    """The links of one module. `notify(link, kind, text, trouble)` is called with news for the user.
 
-    def __init__(self, space: TopicSpace, instance: int, notify: Callable[[Link, str, str, bool], None]) -> None:
+    `sole_transport`: there will be no other links than those of the transport that attaches the first one.
+    """
+
+    def __init__(
+        self,
+        space: TopicSpace,
+        instance: int,
+        notify: Callable[[Link, str, str, bool], None],
+        *,
+        sole_transport: bool = False,
+    ) -> None:
         self.selection = LinkSelection(instance)
         self._space = space
         self._instance = instance
         self._own_instance = instance.to_bytes(4, "little")
         self._own_name = space.module.encode()
         self._notify = notify
+        self._sole_transport = sole_transport
         self._ports: dict[str, _MultihomedPort] = {}
         """Ports by the name of the link."""
         self._by_number: dict[int, _MultihomedPort] = {}
@@ -58,6 +69,7 @@ class MultihomedModule:
         self._ports[link.name] = self._by_number[port.number] = port
         self._unable.clear()
         link.gateway_hooks = port
+        self._announce_sole_link()
 
     def detach(self, link: Link) -> None:
         """Remove a link that the module no longer has."""
@@ -66,6 +78,7 @@ class MultihomedModule:
         self._unable.clear()
         self.selection.close(self._now(), port.number)
         self.selection.forget(port.number)
+        self._announce_sole_link()
         self._act()
 
     def link_changed(self, link: Link) -> None:
@@ -85,6 +98,12 @@ class MultihomedModule:
     def close(self) -> None:
         """Stop, as the module ends."""
         self._alarm.close()
+
+    def _announce_sole_link(self) -> None:
+        """Let a gateway at the other end of the only line forward at once: messages can't come by another way, too."""
+        sole = self._sole_transport and len(self._ports) == 1
+        for port in self._ports.values():
+            port.link.discovery.announce_sole_link(sole=sole and port.link.point_to_point)
 
     # Received messages
 

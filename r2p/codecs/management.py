@@ -137,6 +137,7 @@ HELLO_TOOL = 2  # an observer, which sends no ALIVE
 HELLO_LEAVING = 4
 HELLO_GATEWAY = 8  # forwards messages of others: of what it sends, not all is its own
 HELLO_ALIAS = 16  # `module` is the alias of a longer name, which NAME has
+HELLO_SOLE_LINK = 32  # on a line: its module has no other link
 
 LEASE_MS_MAX = 0xFFFF
 """The longest lease that a Hello can carry (ms)."""

@@ -100,7 +100,10 @@ class _RefusedLink(msgspec.Struct, eq=False):
 
 
 class LinkManager:
-    """The links of one module, from its opening on; `on_command` is called with the commands of other modules."""
+    """The links of one module, from its opening on; `on_command` is called with the commands of other modules.
+
+    `sole_transport`: no other one will be opened than that of the first link.
+    """
 
     def __init__(
         self,
@@ -111,6 +114,7 @@ class LinkManager:
         observer: bool,
         bridge: BridgeOptions | None,
         allow_control: bool = False,
+        sole_transport: bool = False,
     ) -> None:
         self.space = space
         self.links: list[Link] = []
@@ -154,7 +158,7 @@ class LinkManager:
             space.make_topic = self.bridge.make_topic
             self.own_services.relay = self.bridge.calls
         else:
-            self._bridging = MultihomedModule(space, self.instance, self.link_notice)
+            self._bridging = MultihomedModule(space, self.instance, self.link_notice, sole_transport=sole_transport)
 
     def set_flags(self, flags: int) -> None:
         """Announce a new state of the module."""

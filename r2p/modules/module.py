@@ -153,6 +153,7 @@ class Module:
             observer=self.observer,
             bridge=self._bridge_options,
             allow_control=self._allow_control,
+            sole_transport=len(self._via) == 1,
         )
         self._opened.own_services.serve(Operation.STATISTICS, lambda argument: encode(self.statistics(), argument))
         self._node_control.serve(self._opened.own_services, clock, self._check_startable)

@@ -44,6 +44,11 @@ def state(module: r2p.Module, link: str) -> str:
     return next(each.state for each in module.gateway_statistics().ports if each.link == link)
 
 
+def managed(script: Script) -> list[management.Management]:
+    """The management messages that were said."""
+    return [each.management for each in script.said if each.topic == "R2P"]
+
+
 def fake(number: int, heard: int, port: int) -> bytes:
     """A made-up gateway, which says that it hears another one."""
     hearing = struct.pack("<BIB", 1, heard, port).ljust(18, b"\0")
@@ -73,8 +78,7 @@ async def test_topics_of_the_gateway_itself_are_announced_to_clients_that_come_l
     async with r2p.Module("GW", via=["memory:a", client], bridge=True) as gw, node_in(gw, name="own") as own:
         own.advertise("leds", Led)
         await asyncio.sleep(CONVERGED)
-        announced = [each.management for each in client.said if each.topic == "R2P"]
-        assert "leds" in [each.topic for each in announced if isinstance(each, management.Advertise)]
+        assert "leds" in [each.topic for each in managed(client) if isinstance(each, management.Advertise)]
 
 
 class Visitors(Client):
@@ -85,16 +89,20 @@ class Visitors(Client):
         opened()
         await asyncio.get_running_loop().create_future()
 
-    async def visit(self, number: int) -> None:
+    def connect(self, number: int) -> Client:
         client = Client()
         client.link = link = LineLink(f"tcp:127.0.0.1:{number}", self.hub)
         link.admits_gateways = False
         self.hub.attach(link)
         link.connect(client)
+        return client
+
+    async def visit(self, number: int) -> None:
+        client = self.connect(number)
         client.hear(manage(management.SubscribeRequest("leds", 5, 5)))
         await asyncio.sleep(1)
-        link.close()
-        self.hub.detach(link)
+        client.link.close()
+        self.hub.detach(client.link)
 
 
 async def test_a_client_that_left_leaves_nothing_behind(caplog: pytest.LogCaptureFixture) -> None:
@@ -152,6 +160,39 @@ async def test_a_client_that_plays_gateways_stops_nobody_else(caplog: pytest.Log
         assert state(gw, "script") == "refused"
         assert client.link.losses["gateway refused"] == 100
         assert "?gateways=yes" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("flags", "hops", "passes"),
+    [
+        (management.HELLO_SOLE_LINK, 0, True),
+        (management.HELLO_SOLE_LINK | management.HELLO_TOOL, 0, True),
+        (management.HELLO_TOOL, 0, False),
+        (management.HELLO_SOLE_LINK | management.HELLO_GATEWAY, 0, False),
+        (management.HELLO_SOLE_LINK, 1, False),
+    ],
+)
+async def test_a_client_that_has_no_other_link_need_not_wait(flags: int, hops: int, passes: bool) -> None:
+    visitors = Visitors()
+    async with r2p.Module("GW", via=["memory:a", visitors], bridge=True) as gw, node("A", "a") as a:
+        a.advertise("leds", Led)
+        await asyncio.sleep(CONVERGED)
+        client = visitors.connect(1000)
+        client.hear(manage(management.Hello("PC", 7, flags | management.HELLO_QUERY, hops, 5000, 4, "")))
+        await asyncio.sleep(0.1)
+        told = "leds" in [each.topic for each in managed(client) if isinstance(each, management.TypeInfo)]
+        assert (state(gw, client.link.name), told) == ("alone" if passes else "listening", passes)
+        client.hear(fake(7, gw.instance, 250))
+        assert state(gw, client.link.name) == "refused"
+
+
+@pytest.mark.parametrize(("others", "said"), [([], True), (["memory:a"], False)])
+async def test_a_module_says_that_a_line_is_its_only_link(others: list[str], said: bool) -> None:
+    script = Script()
+    async with r2p.Module("A", via=[script, *others]):
+        await asyncio.sleep(0.1)
+        hello = next(each for each in managed(script) if isinstance(each, management.Hello))
+        assert bool(hello.flags & management.HELLO_SOLE_LINK) is said
 
 
 async def test_a_gateway_may_join_where_it_is_allowed() -> None:

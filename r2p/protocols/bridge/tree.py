@@ -226,8 +226,8 @@ class ClientPorts:
     A client is a module or a tool at the other end of a connection of its own, not a gateway. So nothing that a client
     says changes what other links forward. One that sends BRIDGE or MESH, or by whose connection a probe of this gateway
     comes back, is a gateway: it is refused for as long as its connection lasts. Each client is given LISTEN to show
-    that before its port forwards. Modules with several links send LEAF here, too: each is waited for on its own
-    connection.
+    that before its port forwards, unless it says that it has no other link (`admit`). Modules with several links
+    send LEAF here, too: each is waited for on its own connection.
 
     Every method takes `now` (monotonic ns) and appends to `actions`. Periodic work does not grow with the number of
     clients, except for messages to all of them.
@@ -252,6 +252,13 @@ class ClientPorts:
         self._listening.append(port)
         self._send_bridge(now, port)
         return port
+
+    def admit(self, now: int, port: TreePort) -> None:
+        """Forward at once: the client has said that it has no other link, so it is no gateway either."""
+        if port in self._listening:
+            self._listening.remove(port)
+            port.opened_at = now - LISTEN
+            self._update(now, port)
 
     def close(self, number: int) -> None:
         """Remove the port of a client whose connection ended."""

@@ -89,6 +89,7 @@ class Announcer:
         """The same for published topics, and peers that subscribe to them."""
         self._observer = observer
         self.is_gateway = False
+        self.has_sole_link = False
         self.outbox = outbox
         self._directory = directory
         self._names = names
@@ -343,6 +344,7 @@ class Announcer:
         """Return this module's HELLO. Its lease outlasts two lost rounds, or a late one where nothing is lost."""
         flags |= management.HELLO_TOOL if self._observer else 0
         flags |= management.HELLO_GATEWAY if self.is_gateway else 0
+        flags |= management.HELLO_SOLE_LINK if self.has_sole_link else 0
         release = __version__[: management.RELEASE_MAX]
         return management.Hello(self.module, self.instance, flags, 0, self._lease, management.WIRE_VERSION, release)
 

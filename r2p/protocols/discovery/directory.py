@@ -225,6 +225,7 @@ class Directory:
             instance=message.instance,
             observer=bool(message.flags & management.HELLO_TOOL),
             gateway=bool(message.flags & management.HELLO_GATEWAY),
+            sole_link=bool(message.flags & management.HELLO_SOLE_LINK),
             lease=lease_in(message),
             hops=message.hops,
             source=source,

@@ -91,7 +91,7 @@ class ModuleInfo(msgspec.Struct, frozen=True, gc=False):
     `flags` are those of its ALIVE, `last_heard` is in monotonic ns. Only an r2p module has an `instance` (the random
     number of its start), a `lease` (ns that it may be silent), and may be an `observer`, a tool that sends no ALIVE.
     `hops` is the number of gateways in between. `wire` and `release` are those of its HELLO (0 and empty: not known).
-    `gateway` is known only of modules on the link itself.
+    `gateway` and `sole_link`, that it has no other link than the line, are known only of modules on the link itself.
     """
 
     name: str
@@ -105,6 +105,7 @@ class ModuleInfo(msgspec.Struct, frozen=True, gc=False):
     wire: int = 0
     release: str = ""
     gateway: bool = False
+    sole_link: bool = False
 
     @property
     def r2p(self) -> bool:
@@ -117,7 +118,8 @@ class ModuleInfo(msgspec.Struct, frozen=True, gc=False):
 
     def is_repeated_by(self, hello: management.Hello, source: PeerAddress) -> bool:
         """Return whether a HELLO from this address says the same as this entry, but for the lease, and asks nothing."""
-        flags = management.HELLO_TOOL * self.observer | management.HELLO_GATEWAY * self.gateway
+        flags = management.HELLO_TOOL * self.observer
+        flags |= management.HELLO_GATEWAY * self.gateway | management.HELLO_SOLE_LINK * self.sole_link
         return (
             self.instance == hello.instance
             and flags == hello.flags

@@ -199,6 +199,9 @@ class DiscoveryProtocol(ABC):
         """Announce from now on that this module is a gateway; for networks where messages do not name their sender."""
         self.is_gateway = True
 
+    def announce_sole_link(self, *, sole: bool) -> None:
+        """Announce from now on whether this module has no other link, so that a gateway there need not wait for it."""
+
     # What users and gateways ask for
 
     def command(self, now: int, command: Command, module: str) -> list[Event]:

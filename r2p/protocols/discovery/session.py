@@ -195,6 +195,9 @@ class Discovery(DiscoveryProtocol):
     def announce_gateway(self) -> None:
         self.is_gateway = self._announcer.is_gateway = True
 
+    def announce_sole_link(self, *, sole: bool) -> None:
+        self._announcer.has_sole_link = sole
+
     # What users and gateways ask for
 
     def query(self, now: int) -> list[Event]:
