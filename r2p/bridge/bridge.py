@@ -206,10 +206,11 @@ class Bridge:
         return self._is_own(port, message) or self._receive_presence(port, message, data)
 
     def modules_changed(self, port: BridgePort) -> None:
-        """Pass on what discovery has learnt on a link, and let a client in that has no other link."""
+        """Pass on what discovery has learnt on a link, and forward at once to a module that has no other link."""
         modules = port.link.discovery.modules.values()
-        if port.is_client and any(info.sole_link and not (info.hops or info.gateway) for info in modules):
-            self.tree.clients.admit(self._clock.monotonic(), port.tree_port)
+        if port.tree_port.private and any(info.sole_link and not (info.hops or info.gateway) for info in modules):
+            ports = self.tree.clients if port.is_client else self.tree
+            ports.admit(self._clock.monotonic(), port.tree_port)
             self._act()
         self.directory.changed(port)
 

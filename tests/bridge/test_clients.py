@@ -89,10 +89,10 @@ class Visitors(Client):
         opened()
         await asyncio.get_running_loop().create_future()
 
-    def connect(self, number: int) -> Client:
+    def connect(self, number: int, *, admits_gateways: bool = False) -> Client:
         client = Client()
         client.link = link = LineLink(f"tcp:127.0.0.1:{number}", self.hub)
-        link.admits_gateways = False
+        link.admits_gateways = admits_gateways
         self.hub.attach(link)
         link.connect(client)
         return client
@@ -172,18 +172,23 @@ async def test_a_client_that_plays_gateways_stops_nobody_else(caplog: pytest.Log
         (management.HELLO_SOLE_LINK, 1, False),
     ],
 )
-async def test_a_client_that_has_no_other_link_need_not_wait(flags: int, hops: int, passes: bool) -> None:
+@pytest.mark.parametrize("admits_gateways", [False, True])
+async def test_a_module_at_a_line_that_has_no_other_link_need_not_wait(
+    flags: int, hops: int, passes: bool, admits_gateways: bool
+) -> None:
     visitors = Visitors()
     async with r2p.Module("GW", via=["memory:a", visitors], bridge=True) as gw, node("A", "a") as a:
         a.advertise("leds", Led)
         await asyncio.sleep(CONVERGED)
-        client = visitors.connect(1000)
+        client = visitors.connect(1000, admits_gateways=admits_gateways)
         client.hear(manage(management.Hello("PC", 7, flags | management.HELLO_QUERY, hops, 5000, 4, "")))
         await asyncio.sleep(0.1)
         told = "leds" in [each.topic for each in managed(client) if isinstance(each, management.TypeInfo)]
         assert (state(gw, client.link.name), told) == ("alone" if passes else "listening", passes)
         client.hear(fake(7, gw.instance, 250))
-        assert state(gw, client.link.name) == "refused"
+        await asyncio.sleep(0.01)
+        waits = "converging" if passes else "listening"
+        assert state(gw, client.link.name) == (waits if admits_gateways else "refused")
 
 
 @pytest.mark.parametrize(("others", "said"), [([], True), (["memory:a"], False)])

@@ -79,6 +79,12 @@ class SpanningTree:
             port.forwards_until = 0
         self._update(now)
 
+    def admit(self, now: int, port: TreePort) -> None:
+        """Forward at once on a private link: the only module there has said that it has no other link."""
+        if port.state is PortState.LISTENING:
+            port.opened_at = now - LISTEN
+            self._update(now, port)
+
     def pop_actions(self) -> list[Action]:
         """Return and forget the actions."""
         actions = self._actions + self.clients.actions
