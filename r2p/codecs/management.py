@@ -488,7 +488,11 @@ _CODEC = Codec[Management](
 )
 
 
-@functools.lru_cache(maxsize=4096)
+_CACHED = 16_384
+"""Messages that are remembered as they are encoded and decoded: 200 modules in a process have 6 000."""
+
+
+@functools.lru_cache(maxsize=_CACHED)
 def encode(message: Management) -> bytes:
     """Encode a message to 32 bytes. Raises `MessageError`, which names the field, for a value that does not fit.
 
@@ -504,7 +508,7 @@ def decode(data: bytes) -> Management:
     return _decode(bytes(data))
 
 
-@functools.lru_cache(maxsize=4096)
+@functools.lru_cache(maxsize=_CACHED)
 def _decode(data: bytes) -> Management:
     """`decode`, cached: modules repeat themselves byte by byte, and all modules of a process receive the same bytes."""
     message = _CODEC.decode(data)

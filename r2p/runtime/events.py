@@ -76,6 +76,8 @@ class EventHub:
         return listener
 
     def emit(self, event: ModuleEvent) -> None:
+        if not self._listeners:  # as almost always
+            return
         for listener in list(self._listeners.values()):
             listener.lost += len(listener.queue) == EVENTS
             listener.queue.append(event)
