@@ -284,7 +284,8 @@ class SubscriptionNegotiation:
         peer = self._get_or_create(info.source)
         if peer is None:
             return
-        if peer.subscriptions and not peer.is_r2p(now):  # nor was it firmware that had subscribed before the link was down
+        if peer.subscriptions and not peer.is_r2p(now):
+            # Nor was it firmware that had subscribed before the link was down.
             for topic in [topic for topic, restarted in peer.subscriptions.items() if restarted]:
                 self._remove_subscriber(peer, topic)
         if is_new and peer.r2p_until:  # the first HELLO of all may just be later than its module's requests
