@@ -230,6 +230,7 @@ class XmlRpcServer:
         self._server: asyncio.Server | None = None
         self._connections: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
         """The one that has been idle for longest first."""
+        self._closed = False
 
     async def start(self) -> None:
         """Accept connections."""
@@ -237,7 +238,9 @@ class XmlRpcServer:
 
     async def close(self) -> None:
         """Stop, and close all connections."""
+        self._closed = True
         if self._server is not None:
+            await _stop_accepting(self._server)
             self._server.close()
         self._socket.close()
         for writer in self._connections.values():
@@ -250,6 +253,9 @@ class XmlRpcServer:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task is not None
+        if self._closed:  # it was accepted just before
+            writer.transport.abort()
+            return
         self._connections[task] = writer
         if len(self._connections) > CONNECTIONS_MAX:
             self._lost["XMLRPC connections over the limit"] += 1
@@ -287,6 +293,17 @@ class XmlRpcServer:
         except Exception:
             logger.exception("internal error while answering an XMLRPC call")
             return encode_fault(-1, "internal error")
+
+
+async def _stop_accepting(server: asyncio.Server) -> None:
+    """Return when connections that were accepted are made: asyncio before Python 3.13 leaves their sockets open if the
+    server is closed in between.
+    """
+    for sock in server.sockets:
+        with contextlib.suppress(NotImplementedError):  # on Windows
+            server.get_loop().remove_reader(sock)
+    for _ in range(2):
+        await asyncio.sleep(0)
 
 
 async def _respond(writer: asyncio.StreamWriter, status: str, kind: str, body: bytes) -> None:

@@ -255,6 +255,21 @@ async def test_many_connections_at_once(server: XmlRpcServer) -> None:
         assert len(server._connections) == module.CONNECTIONS_MAX
 
 
+@pytest.mark.parametrize("turns", range(6))
+async def test_a_connection_that_comes_as_the_server_closes(turns: int) -> None:
+    """It may have been accepted already, but nobody serves it yet."""
+    server = XmlRpcServer("127.0.0.1", answer, Counter())
+    await server.start()
+    with socket.create_connection(("127.0.0.1", server.port)) as client:
+        client.setblocking(False)
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await server.close()
+        async with asyncio.timeout(20):
+            with contextlib.suppress(ConnectionError):
+                assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
+
+
 async def test_a_server_that_closes_while_clients_do_not_read(server: XmlRpcServer) -> None:
     _, writer = await asyncio.open_connection("127.0.0.1", server.port)
     writer.write(post(BODY) * 100)
