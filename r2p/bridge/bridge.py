@@ -207,11 +207,12 @@ class Bridge:
 
     def modules_changed(self, port: BridgePort) -> None:
         """Pass on what discovery has learnt on a link, and forward at once to a module that has no other link."""
-        modules = port.link.discovery.modules.values()
-        if port.tree_port.private and any(info.sole_link and not (info.hops or info.gateway) for info in modules):
-            ports = self.tree.clients if port.is_client else self.tree
-            ports.admit(self._clock.monotonic(), port.tree_port)
-            self._act()
+        if port.tree_port.private and port.tree_port.state is PortState.LISTENING:
+            modules = port.link.discovery.modules.values()
+            if any(info.sole_link and not (info.hops or info.gateway) for info in modules):
+                ports = self.tree.clients if port.is_client else self.tree
+                ports.admit(self._clock.monotonic(), port.tree_port)
+                self._act()
         self.directory.changed(port)
 
     def order_refused(self, link: Link, order: management.Order, reason: int) -> None:

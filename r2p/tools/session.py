@@ -150,7 +150,7 @@ _INSTANT = 1e-9  # s: two instants of a clock differ by at least so much, their 
 
 
 async def moments(duration: float | None, period: float) -> AsyncIterator[float]:
-    """Yield the seconds since the start, once each period and at the end; without `duration` there is none."""
+    """Yield the seconds since the start, once in each period, and after `duration` seconds; None: without an end."""
     loop = asyncio.get_running_loop()
     start = loop.time()
     time = 0.0

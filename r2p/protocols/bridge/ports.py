@@ -217,6 +217,10 @@ class TreePort(msgspec.Struct, eq=False):
             due = min(due, max(agreed, ready) + SETTLE)
         return due
 
+    def stop_listening(self, now: int) -> None:
+        """Let the time for other gateways to show be over: none can be there."""
+        self.opened_at = now - LISTEN
+
     # What comes in
 
     def forgive_flaps(self, now: int) -> None:

@@ -80,10 +80,9 @@ class SpanningTree:
         self._update(now)
 
     def admit(self, now: int, port: TreePort) -> None:
-        """Forward at once on a private link: the only module there has said that it has no other link."""
-        if port.state is PortState.LISTENING:
-            port.opened_at = now - LISTEN
-            self._update(now, port)
+        """Forward from now on, as the module at the other end of a private link is not a gateway."""
+        port.stop_listening(now)
+        self._update(now, port)
 
     def pop_actions(self) -> list[Action]:
         """Return and forget the actions."""
@@ -260,11 +259,10 @@ class ClientPorts:
         return port
 
     def admit(self, now: int, port: TreePort) -> None:
-        """Forward at once: the client has said that it has no other link, so it is no gateway either."""
-        if port in self._listening:
-            self._listening.remove(port)
-            port.opened_at = now - LISTEN
-            self._update(now, port)
+        """Forward from now on, as the client is not a gateway."""
+        self._listening.remove(port)
+        port.stop_listening(now)
+        self._update(now, port)
 
     def close(self, number: int) -> None:
         """Remove the port of a client whose connection ended."""

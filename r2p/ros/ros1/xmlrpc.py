@@ -253,7 +253,7 @@ class XmlRpcServer:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task is not None
-        if self._closed:  # it was accepted just before
+        if self._closed:  # the connection was accepted just before
             writer.transport.abort()
             return
         self._connections[task] = writer
@@ -296,8 +296,9 @@ class XmlRpcServer:
 
 
 async def _stop_accepting(server: asyncio.Server) -> None:
-    """Return when connections that were accepted are made: asyncio before Python 3.13 leaves their sockets open if the
-    server is closed in between.
+    """Accept no more connections, and return when those that were accepted are set up.
+
+    If a server is closed in between, asyncio (Python 3.11) leaves their sockets open.
     """
     for sock in server.sockets:
         with contextlib.suppress(NotImplementedError):  # on Windows

@@ -45,7 +45,7 @@ _STATES: Final = {
 
 
 class R2pSimBus(can.BusABC):
-    """A node on the simulated bus named `channel`. If there is no such bus yet, it is created.
+    """A node on the simulated bus named `channel`, which is created if it does not exist.
 
     All methods may be called from any thread. In a coroutine, receive with `can.Notifier(bus, listeners, loop=loop)`:
     the bus stands still while a call waits. Under virtual time (`r2p.sim.run`) each message is then handled at the very

@@ -75,7 +75,7 @@ class ReportedBus(msgspec.Struct):
 
     @property
     def supply(self) -> SlotSupply:
-        """The slots that nobody owns in any cycle."""
+        """The free slots: those that are reserved in no cycle."""
         mask = 1
         for row in self.slots:
             for slot in row.slots:

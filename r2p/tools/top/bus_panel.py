@@ -18,7 +18,7 @@ class BusPanel(TextLines):
     """One bus."""
 
     def show_bus(self, bus: BusFigures | None, which: str) -> None:
-        """Show a bus; `which`: its number among the buses. None: there is none."""
+        """Show a bus, or that none has been heard of yet. `which` says which one it is if there are several."""
         if bus is None:
             self.show("no figures of a bus yet: they come from bus_load and bus_slots, of an r2p module on a CAN bus")
         else:

@@ -208,11 +208,11 @@ class TiltOne(EmulatedRobot):
         return body.x, body.y, body.w
 
     def hold(self) -> None:
-        """Hold it as it is: nothing moves any more."""
+        """Hold the robot in its present pose, until `let_go`."""
         self.hardware.body.held = True
 
     def let_go(self) -> None:
-        """Leave it to its controllers."""
+        """Release the robot: from now on its controllers have to keep it upright."""
         self.hardware.body.held = False
 
     def shove(self, impulse: float, height: float = 1.0) -> None:
