@@ -16,6 +16,7 @@ from typing import Any
 import r2p
 from r2p.codecs.management import decode_size, encode_size
 from r2p.messages import SIZE_MAX
+from r2p.messages.layouts import fingerprint_of_class, full_name
 from r2p.services.definition import Definition, define
 from r2p.tools.output import Output
 from r2p.tools.run import load_module
@@ -53,7 +54,7 @@ def load_type(text: str, others: Iterable[type[r2p.Message]] = ()) -> type[r2p.M
 
 
 def _by_full_name(text: str, known: list[type[r2p.Message]]) -> type[r2p.Message]:
-    by_name = {r2p.layout(cls).name: cls for cls in reversed(known)}
+    by_name = {full_name(cls): cls for cls in reversed(known)}
     found = by_name.get(text.replace("/msg/", "/")) or _of_ros(text)
     if found is None:
         close = difflib.get_close_matches(text, by_name, n=1)
@@ -157,7 +158,7 @@ def standard_types() -> list[type[r2p.Message]]:
 
 def type_name(cls: type[r2p.Message]) -> str:
     """Return the full name of a class; the bare one of a class that was learnt without."""
-    name = r2p.layout(cls).name
+    name = full_name(cls)
     return cls.__name__ if cls.__module__ == LEARNT and name.startswith("r2p_msgs/") else name
 
 
@@ -280,7 +281,7 @@ class Types:
         """Return the known class of a layout."""
         if self._by_fingerprint is None:
             known = [*standard_types(), *self.named]
-            self._by_fingerprint = {r2p.layout(cls).fingerprint: cls for cls in reversed(known)}
+            self._by_fingerprint = {fingerprint_of_class(cls): cls for cls in reversed(known)}
         return self._by_fingerprint.get(fingerprint)
 
 

@@ -33,6 +33,7 @@ from r2p.messages import (
     u16,
     u32,
 )
+from r2p.messages.layouts import fingerprint_of_class
 from r2p.messages.shapes import format_of
 from r2p.msg import Led, Velocity3
 from tests.messages import text_annotations
@@ -73,6 +74,16 @@ def test_schema_and_size(cls: type[Message], size: int, schema: str) -> None:
     assert (shape.size, shape.schema) == (size, schema)
     assert shape.fingerprint == blake2b(schema.encode(), digest_size=8).digest()
     assert shape.cls is cls
+
+
+def test_the_fingerprint_of_a_class_is_that_of_its_layout_and_compiles_none() -> None:
+    class Arm(Message):
+        name: Annotated[str, Len(4)] = ""
+        joints: tuple[Velocity3, Velocity3] = (Velocity3(), Velocity3())
+
+    found = fingerprint_of_class(Arm)
+    assert "_layout" not in vars(Arm)
+    assert found == layout(Arm).fingerprint == fingerprint_of_class(Arm)
 
 
 def test_fields_are_a_tree_for_tools() -> None:
