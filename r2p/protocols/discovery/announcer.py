@@ -62,8 +62,8 @@ class _AnswerPart(msgspec.Struct, frozen=True):
 class Announcer:
     """The announcements of one module, sent as fast as the schedule allows.
 
-    While r2p modules are known on the link (`r2p`), a TYPE goes before each announcement, and endpoints are announced.
-    The names behind aliases are announced always, and before what travels as the alias.
+    While r2p modules are known on the link (`r2p`), or no others can be there, a TYPE precedes each announcement, and
+    endpoints are announced. The names behind aliases are announced always, and before what travels as the alias.
     """
 
     def __init__(
@@ -81,6 +81,7 @@ class Announcer:
         self.instance = instance
         self.flags = 0
         self.r2p = False
+        self._announces_endpoints = False
         self.topics: dict[int, dict[str, LocalTopic]] = {ROLE_PUBLISHES: {}, ROLE_SUBSCRIBES: {}}
         """Topics that the module publishes and subscribes to, by ROLE_... and name."""
         self.publisher_counts: Counter[str] = Counter()
@@ -147,7 +148,7 @@ class Announcer:
                 self._add_name(KIND_NODE, node)
             self._endpoints[key] = publisher_class
             self._ended.pop(Item(ItemKind.ENDPOINT_GONE, key, once=True), None)
-            if self.r2p:
+            if self._has_readers:
                 self._add(ItemKind.ENDPOINT, *key)
 
     def remove_endpoint(self, node: str, topic: str, role: int) -> None:
@@ -161,7 +162,7 @@ class Announcer:
     def _announce_end(self, kind: ItemKind, *key: str | int) -> None:
         """Announce the end of a subscription or endpoint, now or after an outage: others may keep it for good."""
         item = Item(kind, key, once=True)
-        if self.outbox.up and (self.r2p or self._directory.has_addresses):  # firmware has no such message
+        if self.outbox.up and self._has_readers:
             self._schedule.add(item)
         elif self._directory.is_lossless and key in self._said:
             self._ended[item] = None
@@ -242,22 +243,28 @@ class Announcer:
         self._schedule.relay(Item(ItemKind.RELAY, key, once=True))
 
     def update_r2p(self) -> None:
-        """Begin or end the announcement of endpoints, which only r2p modules understand."""
+        """Begin or end what only r2p modules understand, as the first one has come, or the last one has gone."""
         self._schedule.set_crowd(self._directory.crowd)
-        r2p = self._directory.r2p_modules > 0
-        if self.r2p == r2p:
-            return
-        self.r2p = r2p
-        if r2p:
+        before, self.r2p = self.r2p, self._directory.r2p_modules > 0
+        if self.r2p and not before:
             for item in self._ended:
                 self._schedule.add(item)
             self._ended.clear()
             self._said.clear()
-        for key in self._endpoints:
-            if r2p:
-                self._add(ItemKind.ENDPOINT, *key)
-            else:
-                self._drop(ItemKind.ENDPOINT, *key)
+        if self._announces_endpoints != self._has_readers:
+            self._announces_endpoints = self._has_readers
+            for key in self._endpoints:
+                if self._announces_endpoints:
+                    self._add(ItemKind.ENDPOINT, *key)
+                else:
+                    self._drop(ItemKind.ENDPOINT, *key)
+
+    @property
+    def _has_readers(self) -> bool:
+        """Whether all on the link may understand what firmware does not. What is announced once does not wait until the
+        first r2p module is known.
+        """
+        return self.r2p or self._directory.has_addresses
 
     # Names that travel as aliases
 
@@ -346,10 +353,10 @@ class Announcer:
         flags |= management.HELLO_GATEWAY if self.is_gateway else 0
         flags |= management.HELLO_SOLE_LINK if self.has_sole_link else 0
         release = __version__[: management.RELEASE_MAX]
-        return management.Hello(self.module, self.instance, flags, 0, self._lease, management.WIRE_VERSION, release)
+        return management.Hello(self.module, self.instance, flags, 0, self.lease, management.WIRE_VERSION, release)
 
     @property
-    def _lease(self) -> int:
+    def lease(self) -> int:
         """The time that this module may be silent (ms). Rounds take longer the more modules there are."""
         rounds = 2 if self._directory.has_addresses else 3
         return min(max(LEASE, rounds * self._schedule.round_time), FOR_EVER) // MILLISECOND
@@ -398,8 +405,7 @@ class Announcer:
     def _with_type(
         self, own: LocalTopic, topic: str, role: int, messages: list[management.Management]
     ) -> list[management.Management]:
-        # What is announced once is announced with its type, also before the first r2p module is known.
-        if self.r2p or self._directory.has_addresses:
+        if self._has_readers:
             return [own.type_info(topic, role), *messages]
         return [] if own.type.varies else messages  # gateways of firmware would make buffers for messages of one size
 
@@ -416,10 +422,10 @@ class Announcer:
     def _is_known(self) -> bool:
         """Return whether an ALIVE is enough this time: in a crowd, which would take it for firmware if it were new."""
         alone = self._directory.has_addresses  # newcomers are answered alone: the others don't learn a longer lease
-        changed = alone and self._lease != self._said_lease
+        changed = alone and self.lease != self._said_lease
         if self._observer or not self._directory.crowd or self._hello_in <= 0 or changed:
             self._hello_in = (_HELLO_EACH_TOLD if alone else _HELLO_EACH) - 1
-            self._said_lease = self._lease
+            self._said_lease = self.lease
             return False
         self._hello_in -= 1
         return True

@@ -24,7 +24,7 @@ from r2p.protocols.discovery.events import (
     PeerAddress,
 )
 from r2p.protocols.discovery.negotiation import SubscriptionNegotiation
-from r2p.units import SECOND
+from r2p.units import MILLISECOND, SECOND
 
 _REPORT_INTERVAL = 5 * SECOND
 """Ns between two reports of one conflict, or of an echo."""
@@ -146,8 +146,15 @@ class PeerLiveness:
         return True
 
     def expired(self, now: int, name: str) -> None:
-        """Remove an r2p module that was silent for its lease."""
-        self._remove(now, self._directory.modules[name], silent=True)
+        """Remove an r2p module that was silent for its lease, or for this module's own, if they answer one by one."""
+        info = self._directory.modules[name]
+        if self._directory.has_addresses and not info.hops:
+            # Its rounds have become longer with each new module, like those here: it says so only with the next one.
+            end = info.last_heard + self._announcer.lease * MILLISECOND
+            if end > now:
+                self._timers.set(("module", name), end)
+                return
+        self._remove(now, info, silent=True)
 
     def link_down(self, now: int) -> None:
         """Remove all r2p modules."""

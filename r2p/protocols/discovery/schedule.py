@@ -156,6 +156,7 @@ class Schedule:
         if self._lossless == lossless:
             return False
         self._lossless = lossless
+        self._presence_at = min(self._presence_at, self._presence_sent + _ROUND)
         self._hurry()
         return True
 
@@ -166,14 +167,26 @@ class Schedule:
 
     def set_crowd(self, modules: int) -> None:
         """Repeat topics slowly, as so many modules of r2p are on the link; 0: as usual."""
-        if modules and not self._crowd:
-            # From the next step on; where nothing is lost, all was announced to those that are there.
-            self._lap = max(self._eager if self._lossless else self._lap, 1)
-        elif self._crowd and not modules:
+        begins = modules > 0 and not self._crowd
+        if self._crowd and not modules:
             self._include_slow()
         self._crowd = modules
         rounds = min(max(SLOW_ROUNDS, modules), CROWD_ROUNDS) if modules else SLOW_ROUNDS
         self._rounds = _LOSSLESS_ROUNDS if self._lossless and modules else rounds
+        if begins:
+            self._begin_crowd()
+        if self._lossless and modules:
+            self._presence_at = self._presence_sent + self._presence_period
+
+    def _begin_crowd(self) -> None:
+        """Move to the slow ring from the next step on; where nothing is lost, what was announced is there at once."""
+        if not self._lossless:
+            self._lap = max(self._lap, 1)
+        elif self._eager:
+            self._lap = self._eager
+        else:
+            self._slow_down()
+            self._step_at += self._interval
 
     def quicken(self, item: Item) -> None:
         """Repeat an item in the fast ring, if it is in the slow one, until it is settled."""
@@ -210,6 +223,8 @@ class Schedule:
         self._hurry()
         self._step_at = now + self._interval
         self._presence_at = now + self._presence_period
+        if self._lossless:
+            self._presence_sent = now  # the query shows that the module is there
 
     def stop(self) -> None:
         """Wait for the next `start`. Items to announce once are forgotten."""

@@ -224,6 +224,63 @@ def test_a_hello_comes_first_when_nothing_is_lost_any_more() -> None:
     assert any(isinstance(each, m.Advertise) for each in said)
 
 
+def told(modules: int, *, each: int = S // 10) -> tuple[Discovery, list[tuple[int, m.Management]]]:
+    """One that others join, one by one, on a network where each newcomer is answered alone; and what it says to all."""
+    discovery = Discovery("PC1", 99)
+    discovery.set_lossless(0, addresses=True)
+    discovery.advertise(0, "leds", 5)
+    discovery.add_endpoint(0, "blink", "leds", m.ROLE_PUBLISHES)
+    said = [(0, message) for message in sent(discovery.link_up(0))]
+    for n in range(modules):
+        hello = m.Hello(f"M{n}", n + 1, m.HELLO_QUERY, wire=m.WIRE_VERSION)
+        events = hear(discovery, n * each, hello, m.Alive(f"M{n}", 0), source=n)
+        said += [(n * each, message) for message in sent(events)]
+        said += says(discovery, n * each, (n + 1) * each)
+    return discovery, said
+
+
+def says(discovery: Discovery, start: int, end: int) -> list[tuple[int, m.Management]]:
+    return [(now, message) for now, event in run(discovery, start, end) for message in sent([event])]
+
+
+def test_while_many_modules_start_each_says_everything_once() -> None:
+    _, said = told(100, each=20 * MS)
+    kinds = Counter(type(message) for _, message in said)
+    assert kinds == {m.Hello: 1, m.Alive: 1, m.TypeInfo: 1, m.Advertise: 1, m.Endpoint: 1}
+
+
+def test_a_module_may_be_silent_for_two_rounds_of_as_many_modules_as_there_are_now() -> None:
+    """Its last HELLO says 5 s, as it was one of the first."""
+    discovery, _ = told(100)
+    run(discovery, 10 * S, 29 * S)
+    assert len(discovery.modules) == 100
+    run(discovery, 29 * S, 45 * S)
+    assert not discovery.modules
+    discovery, _ = told(3)
+    run(discovery, S, 4 * S)
+    assert len(discovery.modules) == 3
+    run(discovery, 4 * S, 6 * S)
+    assert not discovery.modules
+
+
+def test_a_module_is_heard_in_time_when_the_others_have_gone() -> None:
+    """They forget it after the two rounds of a few modules, and so it does not wait for the end of its long one."""
+    discovery, _ = told(100)
+    run(discovery, 10 * S, 12 * S)
+    for n in range(90):
+        hear(discovery, 12 * S, m.Hello(f"M{n}", n + 1, m.HELLO_LEAVING, wire=m.WIRE_VERSION), source=n)
+    said = says(discovery, 12 * S, 14 * S)
+    assert {type(message) for _, message in said} >= {m.Alive}
+    assert said[0][0] == 12 * S
+
+
+def test_a_module_is_heard_within_a_round_when_messages_begin_to_be_lost() -> None:
+    discovery, _ = told(100)
+    discovery.set_lossless(10 * S, lossless=False)
+    heard = [now for now, message in says(discovery, 10 * S, 25 * S) if isinstance(message, m.Alive)]
+    assert max(later - at for at, later in pairwise([10 * S, *heard])) <= 9 * S / 2
+
+
 def crowded(*, wire: int = m.WIRE_VERSION) -> Discovery:
     """One that knows five others on its link, and repeats a topic."""
     discovery = Discovery("PC1", 99)
