@@ -1,6 +1,7 @@
 """The topics of other modules on one link, for gateways: whether the module itself uses them or not."""
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator, Mapping
+from typing import Any
 
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
@@ -8,6 +9,7 @@ from r2p.protocols.discovery.directory import LEASE, TABLE_MAX, Directory
 from r2p.protocols.discovery.events import PeerAddress
 
 _TopicRole = tuple[str, int]
+_NONE: Mapping[Any, Any] = {}
 
 
 class Demand:
@@ -16,8 +18,14 @@ class Demand:
     def __init__(self, most: int = TABLE_MAX) -> None:
         """`most` topics are kept, and so many sources of each."""
         self._most = most
-        self._sources: dict[_TopicRole, dict[Hashable, None]] = {}
+        self._sources: dict[_TopicRole, dict[Any, Any]] = {}
         self._changed: set[str] = set()
+
+    def __contains__(self, entry: _TopicRole) -> bool:
+        return entry in self._sources
+
+    def __iter__(self) -> Iterator[_TopicRole]:
+        return iter(self._sources)
 
     def is_published(self, topic: str) -> bool:
         return (topic, ROLE_PUBLISHES) in self._sources
@@ -28,8 +36,9 @@ class Demand:
     def topics(self) -> set[str]:
         return {topic for topic, _ in self._sources}
 
-    def sources_of(self, topic: str, role: int) -> list[Hashable]:
-        return list(self._sources.get((topic, role), ()))
+    def sources_of(self, topic: str, role: int) -> Mapping[Any, Any]:
+        """Return the sources of a topic in a role, with what was entered for each."""
+        return self._sources.get((topic, role), _NONE)
 
     def entries_of(self, source: Hashable) -> list[_TopicRole]:
         """Return what a source publishes and subscribes to."""
@@ -40,8 +49,8 @@ class Demand:
         changed, self._changed = self._changed, set()
         return changed
 
-    def add(self, topic: str, role: int, source: Hashable) -> bool:
-        """Enter a source; return False if the table is full."""
+    def add(self, topic: str, role: int, source: Hashable, value: object = None) -> bool:
+        """Enter a source, and a value for it; return False if the table is full."""
         sources = self._sources.get((topic, role))
         if sources is None:
             if len(self._sources) >= self._most:
@@ -50,7 +59,7 @@ class Demand:
             self._changed.add(topic)
         if source not in sources and len(sources) >= self._most:
             return False
-        sources[source] = None
+        sources[source] = value
         return True
 
     def remove(self, topic: str, role: int, source: Hashable) -> None:
@@ -123,7 +132,7 @@ class LeasedDemand(Demand):
     def rename(self, now: int, old: str, new: str) -> None:
         """Move the sources of a topic from its alias to the name behind it, or back."""
         for role in (ROLE_PUBLISHES, ROLE_SUBSCRIBES):
-            for source in self.sources_of(old, role):
+            for source in list(self.sources_of(old, role)):
                 self.expired(old, role, source)
                 self._enter(now, new, role, source)
 

@@ -28,7 +28,8 @@ class ModuleRegistry:
         self._counts = counts
         self._tokens: dict[str, dict[str, ModuleToken]] = {}  # by name and key
         self._software: dict[int, dict[str, SoftwareToken]] = {}  # by instance and key
-        self._endpoint_tokens: Counter[EndpointKey] = Counter()
+        self._more_tokens: Counter[EndpointKey] = Counter()
+        """How many tokens more than one declare an endpoint, of those that several do."""
         self._names: dict[int, str] = {}  # by instance
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
         self._conflict_at: dict[str, int] = {}  # names with several modules, and when that is reported
@@ -63,8 +64,10 @@ class ModuleRegistry:
         key = _endpoint_key(token)
         if key is None or token.instance == self._instance:
             return
-        self._endpoint_tokens[key] = self._endpoint_tokens.get(key, 0) + 1  # twice as fast as +=
-        self._endpoints_of.setdefault(key[0], {})[key] = None
+        if key in self.endpoints:
+            self._more_tokens[key] += 1
+        else:
+            self._endpoints_of.setdefault(key[0], {})[key] = None
         name = self._names.get(key[0], "")
         self.endpoints[key] = EndpointInfo(name, *key, token.publisher_class)
         self.generation += 1
@@ -72,7 +75,11 @@ class ModuleRegistry:
     def endpoint_disappeared(self, token: TopicToken) -> None:
         """Remove the token's endpoint, unless another token declares it as well, such as after a change of class."""
         key = _endpoint_key(token)
-        if key is not None and key in self._endpoint_tokens and decrement(self._endpoint_tokens, key):
+        if key is None or key not in self.endpoints:
+            return
+        if key in self._more_tokens:
+            decrement(self._more_tokens, key)
+        else:
             del self.endpoints[key]
             self._forget_endpoint(key)
             self.generation += 1

@@ -65,7 +65,8 @@ class LivelinessDiscovery(DiscoveryProtocol):
         """`tokens_max`: tokens of other modules that are kept."""
         super().__init__(module, instance, counts, LinkNames())
         self._own = TokenSet(module, instance, observer=observer)
-        self._matching = Matching(self._own, self._outbox)
+        self.tokens_max = TOKENS_MAX if tokens_max is None else tokens_max
+        self._matching = Matching(self._own, self._outbox, self.tokens_max)
         self._modules = ModuleRegistry(module, instance, self._outbox, self.counts)
         self.modules = self._modules.modules
         self.topics = self._matching.topics
@@ -75,7 +76,6 @@ class LivelinessDiscovery(DiscoveryProtocol):
         """The tokens that each key of other sessions stands for."""
         self._carriers: Counter[str] = Counter()
         """How many more keys have a token, of those that several have."""
-        self.tokens_max = TOKENS_MAX if tokens_max is None else tokens_max
         self._refused = RefusedTokens(self.tokens_max, instance)
         self._aliases = ModuleAliases(module, self.counts)
         self._marked_at = 0

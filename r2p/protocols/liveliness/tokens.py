@@ -9,7 +9,7 @@ fit, and report it to their own user.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import cast
 
 import msgspec
@@ -187,15 +187,15 @@ class _PeerSession(msgspec.Struct):
 class Matching:
     """The topics of one network."""
 
-    def __init__(self, own: TokenSet, outbox: Outbox) -> None:
+    def __init__(self, own: TokenSet, outbox: Outbox, most: int) -> None:
+        """`most`: tokens of other modules that are kept, and so topics of each role."""
         self.topics: dict[str, TopicInfo] = {}
-        self.demand = Demand()
-        """Everything that other modules publish and subscribe to, used by this one or not."""
+        self.demand = Demand(most)
+        """Everything that other modules publish and subscribe to, used by this one or not; with their sessions."""
         self._own = own
         self._outbox = outbox
         self._sessions: dict[int, _PeerSession] = {}
         self._subscribers: Counter[str] = Counter()  # sessions that this module sends to, by topic
-        self._sessions_of: dict[TopicRole, dict[int, _PeerSession]] = {}  # by number
         self._mismatches: Counter[str] = Counter()  # sessions and roles whose type does not fit, by topic
 
     def appeared(self, now: int, key: str, token: TopicToken) -> None:
@@ -207,7 +207,7 @@ class Matching:
         tokens = session.tokens.get(topic_role)
         if tokens is None:
             session.tokens[topic_role] = {key: token}
-            self._enter(number, session, topic_role)
+            self.demand.add(token.topic, token.role, number, session)
         else:
             tokens[key] = token
         info = self.topics.get(token.topic)
@@ -224,14 +224,9 @@ class Matching:
         if self._concerns(session, topic_role):
             self._match(number, session, topic_role)
 
-    def _enter(self, number: int, session: _PeerSession, topic_role: TopicRole) -> None:
-        """Enter a session as one that has the topic in this role."""
-        sessions = self._sessions_of.get(topic_role)
-        if sessions is None:
-            self._sessions_of[topic_role] = {number: session}
-        else:
-            sessions[number] = session
-        self.demand.add(*topic_role, number)
+    def _sessions_of(self, topic: str, role: int) -> Mapping[int, _PeerSession]:
+        """Return the sessions that have a topic in this role, by number."""
+        return self.demand.sources_of(topic, role)
 
     def _concerns(self, session: _PeerSession, key: TopicRole) -> bool:
         """Return whether this module has the other role of the topic, or has had it."""
@@ -247,29 +242,25 @@ class Matching:
         del tokens[key]
         if not tokens:
             del session.tokens[topic_role]
-            sessions = self._sessions_of[topic_role]
-            del sessions[token.session]
-            if not sessions:
-                del self._sessions_of[topic_role]
             self.demand.remove(*topic_role, token.session)
         self._match(token.session, session, topic_role)
         if not session.tokens:
             del self._sessions[token.session]
         self._update_type(self.topics[token.topic], token.role)
-        if topic_role not in self._sessions_of:
+        if topic_role not in self.demand:
             self._remove_role(*topic_role)
 
     def changed(self, topic: str, role: int) -> None:
         """Match a topic again after this module begins or ends it in this role, or changes its type."""
         theirs = topic, counterpart(role)
-        for number, session in list(self._sessions_of.get(theirs, {}).items()):
+        for number, session in list(self._sessions_of(*theirs).items()):
             self._clear_mismatch(session, theirs)
             self._match(number, session, theirs)
 
     def mark_heard(self, now: int) -> None:
         """Mark what has a token as heard now."""
         topics = self.topics
-        for topic, role in self._sessions_of:  # a thousand, or more, for each look at the network
+        for topic, role in self.demand:  # a thousand, or more, for each look at the network
             if role == ROLE_PUBLISHES:
                 topics[topic].advertised_at = now
             else:
@@ -299,7 +290,7 @@ class Matching:
     def publisher_types(self, topic: str) -> set[TopicType]:
         """Return the types of a topic's publishers whose messages are accepted."""
         key = topic, ROLE_PUBLISHES
-        sessions = self._sessions_of.get(key, {}).values()
+        sessions = self._sessions_of(*key).values()
         return {_type_of(session.tokens[key]) for session in sessions if key in session.matched}
 
     def _clear_mismatch(self, session: _PeerSession, key: TopicRole) -> None:
@@ -331,13 +322,13 @@ class Matching:
 
     def _update_type(self, info: TopicInfo, role: int) -> None:
         """Give a topic the type of the first session that declares one."""
-        sessions = self._sessions_of.get((info.name, role), {}).values()
+        sessions = self._sessions_of(info.name, role).values()
         types = (_type_of(session.tokens[info.name, role]) for session in sessions)
         info.set_type(role, next((each for each in types if each != TopicType()), None))
 
     def _remove_role(self, topic: str, role: int) -> None:
         """Forget the role of a topic that has lost its last token; without the other role, the topic too."""
-        if (topic, counterpart(role)) not in self._sessions_of:
+        if (topic, counterpart(role)) not in self.demand:
             del self.topics[topic]
         else:
             self.topics[topic].set_heard(role, None)

@@ -281,7 +281,8 @@ def test_nothing_is_kept_of_modules_that_left(world: World) -> None:
         world.crash(instance)
     assert not any([watcher.modules, watcher.endpoints, watcher.topics])
     modules, matching = watcher._modules, watcher._matching
-    assert not any([modules._names, modules._endpoints_of, matching._sessions_of, matching._mismatches])
+    kept = [modules._names, modules._endpoints_of, modules._more_tokens, matching._sessions, matching._mismatches]
+    assert not any([*kept, [*matching.demand]])
 
 
 def test_a_type_that_changes_ends_what_flowed(world: World) -> None:
