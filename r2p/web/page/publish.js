@@ -4,10 +4,10 @@ import { toast } from "./dialogs.js"
 import { button, field, h, place, setText } from "./dom.js"
 import { plural } from "./format.js"
 import { MessageForm } from "./message_form.js"
+import { Retries } from "./retries.js"
 
 const RATE_MAX = 200 // messages per second; r2p/web/dash/publications.py refuses more
 const RATE = 10
-const ATTEMPTS = 3 // to find a type
 
 export const publish = {
   id: "publish",
@@ -47,11 +47,10 @@ class PublishView {
     this.#once, this.#repeat, field("at", this.#rate), "Hz", this.#reset)
   #list = h("ul", { class: "running", "aria-label": "Published at a rate" })
   #chip = h("a", { class: "chip warn", href: "#/publish", hidden: true })
-  #attempts = 0
-  #isUntyped = false
+  #retries = new Retries()
   #update = () => {
     this.#describeTopic()
-    if (this.#isUntyped) this.#makeForm()
+    if (this.#retries.due) this.#makeForm()
   }
 
   constructor(app) {
@@ -116,19 +115,18 @@ class PublishView {
     this.#app.rename("publish", this.#topic)
     setText(this.#error, "")
     this.#show(null)
-    this.#attempts = 0
-    this.#isUntyped = false
+    this.#retries.reset()
     if (!this.#topic) return
     setText(this.#about, "Asking for the type")
     await this.#makeForm()
     this.#describeTopic()
   }
 
-  // A type that could not be found, as the modules that have it were silent, is asked for again with the next figures.
+  // A type that could not be found, as the modules that have it were silent, is asked for again.
   async #makeForm() {
     const [topic, type] = [this.#topic, this.#typeName]
     const isCurrent = () => topic === this.#topic && type === this.#typeName
-    this.#isUntyped = false
+    this.#retries.begin()
     try {
       const form = await this.#formOf(topic, type)
       if (!isCurrent()) return
@@ -137,7 +135,7 @@ class PublishView {
     } catch (error) {
       if (!isCurrent()) return
       setText(this.#error, error.message)
-      this.#isUntyped = this.#app.store.topics.has(topic) && ++this.#attempts < ATTEMPTS
+      if (this.#app.store.topics.has(topic)) this.#retries.fail()
     }
   }
 

@@ -3,12 +3,12 @@
 import { button, field, filterBox, h, setText } from "./dom.js"
 import { count, UNKNOWN } from "./format.js"
 import { MessageForm } from "./message_form.js"
+import { Retries } from "./retries.js"
 import { LiveTable } from "./table.js"
 
 const TIMEOUT = 5 // s
 const TIMEOUT_MAX = 300 // s; r2p/web/dash/publications.py refuses more
 const CALLS = 20 // calls that are listed
-const ATTEMPTS = 3 // to find the types of a service
 
 export const services = {
   id: "services",
@@ -52,11 +52,10 @@ class ServicesView {
   #calls = h("ol", { class: "calls stack", "aria-label": "Calls, the newest first" })
   #said = h("p", { class: "sr-only", role: "status" })
   #panel
-  #attempts = 0
-  #isUndescribed = false
+  #retries = new Retries()
   #update = () => {
     this.#table.update(this.#app.store.services.values())
-    if (this.#isUndescribed) this.#describe()
+    if (this.#retries.due) this.#describe()
   }
 
   constructor(app) {
@@ -108,15 +107,14 @@ class ServicesView {
     this.#calls.replaceChildren()
     setText(this.#title, service)
     setText(this.#error, "")
-    this.#attempts = 0
-    this.#isUndescribed = false
+    this.#retries.reset()
     if (service) await this.#describe()
   }
 
-  // A service that could not be described, as its server was silent, is asked for again with the next figures.
+  // A service that could not be described, as its server was silent, is asked for again.
   async #describe() {
     const service = this.#service
-    this.#isUndescribed = false
+    this.#retries.begin()
     try {
       const { request } = await this.#app.connection.request("describe", { service })
       if (service !== this.#service) return
@@ -125,7 +123,7 @@ class ServicesView {
     } catch (error) {
       if (service !== this.#service) return
       setText(this.#error, error.message)
-      this.#isUndescribed = ++this.#attempts < ATTEMPTS
+      this.#retries.fail()
     }
   }
 
