@@ -416,7 +416,8 @@ class LinkManager:
         """Report that a module on the link itself is gone, while the link is up; without a good-bye, as trouble."""
         info = event.info
         if link.up and not info.observer and not info.hops:
-            silence = f": nothing heard of it for {info.lease / SECOND:.0f} s; does it hang?" if event.silent else ""
+            silent_for = (self.space.clock.monotonic() - info.last_heard) // SECOND
+            silence = f": nothing heard of it for {silent_for} s; does it hang?" if event.silent else ""
             level = logging.WARNING if event.silent else logging.INFO
             self._log_limited(link, level, "gone", f"module {info.name} is gone{silence}")
         self._events.emit(event)

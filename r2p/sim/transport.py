@@ -339,7 +339,7 @@ def can_bus(name: str, **options: Any) -> SimCan:
 
 
 def forget_bus(shared: SimCan) -> None:
-    """Remove a bus whose event loop is about to end, so that nobody joins it any more."""
+    """Remove a bus from those that can be joined, before its event loop ends."""
     with _buses_lock:
         buses = _buses[shared.loop]
         for name in [name for name, each in buses.items() if each is shared]:

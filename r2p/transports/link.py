@@ -278,7 +278,7 @@ class Link(abc.ABC):
         """Send a management message before waiting samples, `urgent` ones before all; lost if nothing moves."""
 
     def write_answer(self, messages: tuple[bytes, ...], to: Hashable) -> None:
-        """Send management messages to one address; only where discovery was told that addresses are possible."""
+        """Send management messages to one address. Only links that pass `addresses=True` to discovery need this."""
         raise NotImplementedError
 
     @abc.abstractmethod

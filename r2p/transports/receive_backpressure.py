@@ -230,7 +230,7 @@ class Backlog(ReceiveBackpressure, Generic[P]):
         self.blocked = BlockedMessage(sample, sinks, self)
 
     def append(self, publisher: P, serial: int, sample: Sample | None) -> bool:
-        """Append a message, or None in place of one that is only acknowledged; return False if there is no room."""
+        """Append a message; return False if there is no room. None stands for one that is only acknowledged."""
         if len(self._queue) >= BACKLOG_MAX or self._bytes >= BACKLOG_BYTES_MAX:
             return False
         self._queue.append((publisher, serial, sample))

@@ -175,3 +175,18 @@ async def test_a_subscriber_of_another_type_does_not_hide_that_of_the_publisher(
         c.subscribe("leds", Float32)
         await asyncio.sleep(0.1)
         assert a.network.topics()["leds"].fingerprint == layout(Led).fingerprint
+
+
+async def test_a_module_of_many_is_said_to_be_gone_after_the_time_in_which_it_was_silent(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Rounds have grown since its HELLO, which said 5 s."""
+    async with AsyncExitStack() as stack:
+        modules = [await stack.enter_async_context(r2p.Module(f"M{n}", via="memory:many")) for n in range(40)]
+        await asyncio.sleep(1.0)
+        (link,) = modules[-1].links
+        assert isinstance(link, MemoryLink)
+        link.disconnect()
+        await asyncio.sleep(10.0)
+        assert len(modules[0].network.modules()) == 39
+    assert "link memory:many: module M39 is gone: nothing heard of it for 9 s" in caplog.text

@@ -553,7 +553,7 @@ class CanBus(BusWire):
             self._dominate()
 
     def _extend(self, transfer: _Transfer, error: ErrorKind, flags_end: int) -> None:
-        """Put off the end of an error frame until the bus is no longer stuck at dominant."""
+        """Extend an error frame until the bus is recessive again."""
         bits = -((transfer.start - self._stuck_until) // self.bit) + DELIMITER
         end = transfer.start + bits * self.bit
         self.timeline.at(end, self._over, transfer, bits, error, end)

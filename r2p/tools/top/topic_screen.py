@@ -131,7 +131,7 @@ class TopicScreen(Screen[None]):
                 self.take_newest()
 
     def take_newest(self) -> None:
-        """Show the newest message, or that there is none since the last time."""
+        """Show the newest message, or that none has come since the last call."""
         sample, self._newest = self._newest, None
         self.show_message(None if sample is None else sample.data)
 

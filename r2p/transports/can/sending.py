@@ -96,7 +96,7 @@ class SocketCanSender(QueuedSender[bytes]):
     """Sends to an interface of Linux."""
 
     def __init__(self, name: str) -> None:
-        """Raises TransportError, which says what to do, if there is no such interface, or if it is down."""
+        """Open the interface `name`. Raises TransportError if it does not exist or is down."""
         super().__init__()
         found = netlink.find_interface(name) if netlink.has_socketcan() else None
         if found is None or found.problem:

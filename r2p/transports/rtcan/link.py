@@ -464,7 +464,7 @@ class RtcanLink(BufferedLink):
 
     @property
     def master(self) -> str:
-        """The module that is the master; empty if there is none, or its name is not known."""
+        """The name of the master's module; empty without a master, or while its name is unknown."""
         id8 = self.engine.network.master
         if id8 is not None and id8 == self.engine.id8:
             return self._space.module
