@@ -179,7 +179,7 @@ class Schedule:
             self._presence_at = self._presence_sent + self._presence_period
 
     def _begin_crowd(self) -> None:
-        """Move to the slow ring from the next step on; where nothing is lost, what was announced is there at once."""
+        """Begin to repeat topics slowly: after one more step, or at once where nothing is lost and all is announced."""
         if not self._lossless:
             self._lap = max(self._lap, 1)
         elif self._eager:

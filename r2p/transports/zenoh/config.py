@@ -177,8 +177,8 @@ _PARSERS: dict[str, Callable[[str], Any]] = {
 LEASE_MS = 1750
 """Milliseconds without a sign of life after which a peer is gone: a hanging one is noticed within two seconds.
 
-Hardly less: where a hundred modules start on two cores, zenoh's two threads that receive do not get to a connection
-for a second, and take it for lost. All of its tokens end and appear again, which keeps others waiting.
+It can't be much shorter: where a hundred modules start on two cores, zenoh's two receiving threads do not get to a
+connection for a second, and take it for lost. Then all of its tokens end and appear again, and some are missed.
 """
 
 _DROP_AFTER = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"  # microseconds
