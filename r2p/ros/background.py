@@ -47,6 +47,11 @@ class BackgroundResults:
             raise found.with_traceback(None)
         return cast("T", found)
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a result is being computed."""
+        return bool(self._waiting)
+
     def is_pending(self, topic: str) -> bool:
         """Return whether a result for a topic is being computed."""
         return any(topic in topics for topics in self._waiting.values())

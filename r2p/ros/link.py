@@ -307,6 +307,10 @@ class RosLink(BufferedLink, MiddlewareUser):
     def known_types(self) -> Iterable[type[Message]]:
         return self._classes.known
 
+    @property
+    def makes_types(self) -> bool:
+        return self._background.is_busy
+
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
         known = (cls for cls in self._classes.known if layout(cls).fingerprint == fingerprint)
         return next(known, None) or self.services.message_type(fingerprint)

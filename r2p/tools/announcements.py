@@ -1,4 +1,7 @@
-"""How long a tool listens for announcements: until nothing new comes, or until what did not come is missing."""
+"""How long a tool listens for announcements: until nothing new comes, or until what did not come is missing.
+
+On ROS it also waits until the types of the topics are made, which have no size before.
+"""
 
 import asyncio
 
@@ -32,7 +35,8 @@ class Announcements:
             ):
                 return True
             await asyncio.sleep(_SETTLE_POLL)
-            if (count := self._known()) != known:
+            makes_types = any(link.makes_types for link in self._module.links)
+            if (count := self._known()) != known or makes_types:
                 known, changed_at = count, loop.time()
         return False
 

@@ -397,6 +397,11 @@ class Link(abc.ABC):
         """Return the classes of topics at the other end that are known here, for others that ask."""
         return ()
 
+    @property
+    def makes_types(self) -> bool:
+        """Whether the types of announced topics are still being made, so that they will be known soon."""
+        return False
+
     def command(self, command: Command, module: str) -> None:
         """Send STOP, REBOOT or BOOTLOAD to a module."""
         self._apply(self.discovery.command(self._clock.monotonic(), command, module))

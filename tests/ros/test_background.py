@@ -30,11 +30,13 @@ async def test_a_thread_computes_once_for_all_topics() -> None:
     assert results.get("a", 1, compute) is None
     assert results.get("b", 1, compute) is None
     assert results.get("c", 2, fail) is None
+    assert results.is_busy
     assert results.is_pending("a")
     assert not results.is_pending("d")
     go.set()
     await asyncio.wait_for(done.wait(), 60)
     assert changed == ["a", "b", "c"]
+    assert not results.is_busy
     assert results.get("a", 1, compute) not in (None, threading.current_thread())
     assert not results.is_pending("a")
     for _ in range(2):

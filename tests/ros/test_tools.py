@@ -6,6 +6,7 @@ import pytest
 
 import r2p
 from r2p.msg import Float32, String
+from r2p.ros.background import BackgroundResults
 from r2p.ros.topics import ros_class
 from r2p.testing.network import node_in
 from r2p.tools.config import Settings
@@ -61,6 +62,22 @@ async def test_a_topic_has_the_type_that_ros_nodes_call_it_by(version: int) -> N
     assert view.fingerprint == r2p.layout(Float32).fingerprint
     assert (view.ros_type, shown["type"]) == ("std_msgs/Float32", "std_msgs/Float32")
     assert later is None
+
+
+@both
+@pytest.mark.virtual_time
+async def test_a_list_waits_until_types_are_made(
+    version: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a busy computer that takes long, and a topic has no size before."""
+    network, loop = FakeRosNetwork(version), asyncio.get_running_loop()
+    network.node("/talker").advertise("/chatter", String)
+    made_at = loop.time() + 4
+    monkeypatch.setattr(BackgroundResults, "is_busy", property(lambda _: loop.time() < made_at))
+    async with r2p.Module("_tool", via=network.transport(), observer=True) as module:
+        await Session(module, Settings(via=[f"ros{version}:"])).settle()
+    assert made_at < loop.time() < made_at + 1
+    assert capsys.readouterr().err == ""
 
 
 @both
