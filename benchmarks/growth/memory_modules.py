@@ -15,7 +15,7 @@ from r2p.msg import Led
 SIZES = (20, 50, 100, 200)
 TOPICS, SUBSCRIBED = 10, (1, 7)
 """Topics of each module, and the modules after it of which it subscribes to one topic."""
-SETTLED, AT_REST = 30.0, 60.0  # s: after twice the slowest round, of 15 s for each 100 modules, all is calm; two of them
+SETTLED, AT_REST = 30.0, 60.0  # s: all is calm after the slowest round, of 30 s; twice that shows all of what they say
 LIMIT = 120.0  # s
 
 

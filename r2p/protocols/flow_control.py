@@ -195,12 +195,12 @@ class ReceiveWindow:
         """Count lost messages towards the next credit, so that it is in time."""
         self.until_credit = max(1, self.until_credit - count)
 
-    def accept(self, size: int) -> bool:
-        """Count a message of this size that the queues accepted; return whether credit is to be granted for it."""
-        self.until_credit -= 1
+    def accept(self, size: int, count: int = 1) -> bool:
+        """Count messages of this size that the queues accepted; return whether credit is to be granted for them."""
+        self.until_credit -= count
         if size > UNCOUNTED_BYTES:
-            self._bytes_until_credit -= size
-        return not self.until_credit or self._bytes_until_credit <= 0
+            self._bytes_until_credit -= size * count
+        return self.until_credit <= 0 or self._bytes_until_credit <= 0
 
     def credit_sent(self) -> None:
         """Start to count towards the next credit."""

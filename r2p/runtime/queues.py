@@ -273,6 +273,10 @@ class SubscriberQueue(Sink):
     def _append(self, sample: Sample) -> None:
         # `Topic.deliver` has a copy of this: change both.
         self.queue.append(sample)
+        self.wake_reader()
+
+    def wake_reader(self) -> None:
+        """Wake the reader, if it waits for a message."""
         if (waiter := self.waiter) is not None:  # woken once: messages that follow find the reader awake
             self.waiter = None
             self._wake_scheduler.wake(self.priority, waiter)

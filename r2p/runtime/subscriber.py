@@ -166,6 +166,7 @@ class Subscriber(Generic[T]):
         # long as the work. `_next` and `_yield_sometimes` are the same for less frequent paths.
         sink, kind, create_future = self._sink, self._type, self._space.loop.create_future
         queue, wake_scheduler, ages = sink.queue, self._space.wake_scheduler, self._max_age is not None
+        decode = None if self._layout is None or ages else self._layout.decode
         while not self._closed:
             if not queue:
                 if sink.waiter is not None:
@@ -183,6 +184,11 @@ class Subscriber(Generic[T]):
                 if sink.wait_queue is not None:
                     sink.refill()
                 message = sample.message
+                if message is None and decode is not None and not self._topic.accepted:
+                    try:  # as `_examine` does, which counts what does not decode
+                        message = sample.message = decode(sample.data)
+                    except DecodeError:
+                        message = None
                 if ages or message.__class__ is not kind:
                     message = self._examine(sample)
                     if message is None:

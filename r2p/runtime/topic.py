@@ -6,6 +6,7 @@ waits: full sinks worth waiting for are returned to the publisher, whose class d
 
 import abc
 import asyncio
+from collections import deque
 from collections.abc import Callable, Hashable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 from weakref import WeakValueDictionary
@@ -195,6 +196,22 @@ class Topic:
         if self.remote_subscribers and not sample.source.link:  # only gateways pass messages from a link on
             blocked = self._send(self.remote_subscribers, sample, blocked, slot_link)
         return blocked if blocked is None else self._remaining(blocked)
+
+    def deliver_run(self, samples: list[Sample], at: int) -> int:
+        """Queue samples from a link in bulk, from `samples[at]` on, as far as there is room; return how many.
+
+        None but for a single subscriber, whose queue does not count bytes: `deliver` takes each of the others.
+        """
+        if len(self.queues) != 1 or self.drop_filter is not None:
+            return 0
+        (sink,) = self.queues
+        queue = sink.queue
+        taken = min(sink.limit - len(queue), len(samples) - at)
+        if taken <= 0 or queue.__class__ is not deque:
+            return 0
+        queue.extend(samples[at : at + taken])
+        sink.wake_reader()
+        return taken
 
     def deliver_by(self, link: str, sample: Sample) -> list[Sink] | None:
         """Offer the sample only to the subscribers behind one link; without any, to all subscribers. See `deliver`."""

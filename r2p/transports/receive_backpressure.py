@@ -203,15 +203,15 @@ class LinkBackpressure(ReceiveBackpressure):
 class Backlog(ReceiveBackpressure, Generic[P]):
     """Messages that wait for room on one topic: the blocked one, and those behind it.
 
-    `deliver` gets each message in its turn, and None for the blocked one when every sink has it; `resume` is called
-    when reading may go on.
+    `deliver` gets messages that came together in their turn, of one publisher and one size, with the serial of the
+    first; and None for the blocked one when every sink has it. `resume` is called when reading may go on.
     """
 
     def __init__(
         self,
         loop: asyncio.AbstractEventLoop,
         lost: LoggedCounter,
-        deliver: Callable[[P, int, Sample | None], None],
+        deliver: Callable[[P, int, list[Sample] | None], None],
         resume: Callable[[], None],
     ) -> None:
         super().__init__(loop, lost)
@@ -221,28 +221,38 @@ class Backlog(ReceiveBackpressure, Generic[P]):
         self._deliver = deliver
         self._resume = resume
         self._blocked_serial: tuple[P, int]  # whose message is blocked, and its serial
-        self._queue: deque[tuple[P, int, Sample | None]] = deque()
-        self._bytes = 0
+        self._queue: deque[tuple[P, int, list[Sample] | None]] = deque()
+        self._messages = self._bytes = 0
 
-    def block(self, publisher: P, serial: int, sample: Sample, sinks: list[Sink]) -> None:
-        """Wait for room in these sinks."""
+    def block(self, publisher: P, serial: int, samples: list[Sample], sinks: list[Sink]) -> None:
+        """Wait for room in these sinks for the first of the messages; the others wait behind it, ahead of the rest."""
         self._blocked_serial = publisher, serial
-        self.blocked = BlockedMessage(sample, sinks, self)
+        self.blocked = BlockedMessage(samples[0], sinks, self)
+        if len(samples) > 1:
+            self._queue.appendleft((publisher, serial + 1, samples[1:]))
+            self._count(samples[1:], 1)
 
-    def append(self, publisher: P, serial: int, sample: Sample | None) -> bool:
-        """Append a message; return False if there is no room. None stands for one that is only acknowledged."""
-        if len(self._queue) >= BACKLOG_MAX or self._bytes >= BACKLOG_BYTES_MAX:
+    def append(self, publisher: P, serial: int, samples: list[Sample] | None) -> bool:
+        """Append messages; return False if there is no room. None stands for one that is only acknowledged."""
+        if self._messages >= BACKLOG_MAX or self._bytes >= BACKLOG_BYTES_MAX:
             return False
-        self._queue.append((publisher, serial, sample))
-        if sample is not None:
-            self._bytes += len(sample.data)
+        self._queue.append((publisher, serial, samples))
+        self._count(samples, 1)
         return True
+
+    def _count(self, samples: list[Sample] | None, sign: int) -> None:
+        """Count messages that come to the queue (1) or leave it (-1)."""
+        if samples is None:
+            self._messages += sign
+        else:
+            self._messages += sign * len(samples)
+            self._bytes += sign * len(samples) * len(samples[0].data)
 
     def clear(self) -> int:
         """Drop everything; return how many messages waited behind the blocked one."""
-        count = sum(sample is not None for _, _, sample in self._queue)
+        count = sum(len(samples or ()) for _, _, samples in self._queue)
         self._queue.clear()
-        self._bytes = 0
+        self._messages = self._bytes = 0
         blocked, self.blocked = self.blocked, None
         if blocked is not None:
             blocked.withdraw()
@@ -264,10 +274,9 @@ class Backlog(ReceiveBackpressure, Generic[P]):
         self.blocked = None
         self._deliver(*self._blocked_serial, None)
         while self._queue and self.blocked is None:
-            publisher, serial, sample = self._queue.popleft()
-            if sample is not None:
-                self._bytes -= len(sample.data)
-            self._deliver(publisher, serial, sample)
+            publisher, serial, samples = self._queue.popleft()
+            self._count(samples, -1)
+            self._deliver(publisher, serial, samples)
         if self.blocked is None:
             self.holds = False
             self._resume()

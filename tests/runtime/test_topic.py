@@ -12,13 +12,12 @@ import pytest
 import r2p
 from r2p.msg import Encoder, Led
 from r2p.runtime.backpressure import WaitQueue
+from r2p.runtime.sample import Sample, Source
 from r2p.runtime.topic import RemoteSubscriber
 from tests.bench import hold, joined, led, local, settle
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from r2p.runtime.sample import Sample
 
 
 class Lamp(r2p.Message):
@@ -142,6 +141,44 @@ async def test_what_came_by_a_link_goes_to_no_link() -> None:
         await settle(1.0)
         assert len(back.queue) == 1  # the local delivery alone
         assert b.links[0].stats.sent == 0
+
+
+def received(count: int) -> list[Sample]:
+    """Samples with the sequences 1 to `count`, from a link."""
+    return [Sample(led(1).encode(), Source("A", "a", "line"), 0, sequence=number + 1) for number in range(count)]
+
+
+@pytest.mark.virtual_time
+async def test_a_single_subscriber_takes_messages_in_bulk_as_far_as_it_has_room() -> None:
+    async with local() as module:
+        leds, samples = module.start(hold, name="a").subscribe("leds", Led, queue=5), received(8)
+        topic = module.space.topics["leds"]
+        reader = asyncio.create_task(leds.fetch())
+        await settle()
+        assert topic.deliver_run(samples, 1) == 5
+        await reader  # it was woken
+        assert [each.sequence for each in leds.queue] == [3, 4, 5, 6]
+        assert topic.deliver_run(samples, 6) == 1
+        assert topic.deliver_run(samples, 7) == 0
+        assert (leds.lost, len(leds.queue)) == (0, 5)
+
+
+@pytest.mark.virtual_time
+async def test_messages_that_are_looked_at_one_by_one_are_not_taken_in_bulk() -> None:
+    async with local() as module:
+        node, samples = module.start(hold, name="a"), received(3)
+        counted = node.subscribe("leds", Led, queue=5, queue_bytes=12)
+        topic = module.space.topics["leds"]
+        assert topic.deliver_run(samples, 0) == 0
+        counted.close()
+        node.subscribe("leds", Led)
+        topic = module.space.topics["leds"]
+        topic.drop_filter = lambda _link: False
+        assert topic.deliver_run(samples, 0) == 0
+        topic.drop_filter = None
+        node.subscribe("leds", Led)
+        assert topic.deliver_run(samples, 0) == 0
+        assert all(not sink.queue for sink in topic.queues)
 
 
 @pytest.mark.virtual_time

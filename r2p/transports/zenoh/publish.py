@@ -130,8 +130,7 @@ class TxStream:
 
 def _packets(samples: list[Sample]) -> Iterator[list[Sample]]:
     """Group messages that may share a packet: of one size, counting on, with one header that is true for all."""
-    for _, alike in groupby(enumerate(samples), _header_key):
-        run = [sample for _, sample in alike]
+    for run in _runs(samples, sized=True):
         most = max(1, _BATCH_BYTES_MAX // max(1, len(run[0].data)))
         for at in range(0, len(run), most):
             yield run[at : at + most]
@@ -139,10 +138,10 @@ def _packets(samples: list[Sample]) -> Iterator[list[Sample]]:
 
 def _varying_packets(samples: list[Sample]) -> Iterator[list[Sample]]:
     """Group messages of any size that may share a packet."""
-    for _, alike in groupby(enumerate(samples), lambda numbered: _header_key(numbered, sized=False)):
+    for run in _runs(samples, sized=False):
         packet: list[Sample] = []
         size = 0
-        for _, sample in alike:
+        for sample in run:
             size += len(sample.data)
             if packet and size > _BATCH_BYTES_MAX:
                 yield packet
@@ -151,11 +150,25 @@ def _varying_packets(samples: list[Sample]) -> Iterator[list[Sample]]:
         yield packet
 
 
-def _header_key(numbered: tuple[int, Sample], *, sized: bool = True) -> object:
-    """Equal for neighbours that may share a header; which must be of one size, if `sized`."""
-    position, each = numbered
-    counts_from = each.sequence - position if each.sequence else None
-    return counts_from, sized and len(each.data), each.deadline, each.hops, each.stamped, each.clock
+def _runs(samples: list[Sample], *, sized: bool) -> Iterator[list[Sample]]:
+    """Split messages into runs that may share a header; those in a run are of one size, if `sized`."""
+    count = len(samples)
+    keys = [
+        (
+            each.sequence and each.sequence - at + count,  # 0: not known
+            sized and len(each.data),
+            each.deadline,
+            each.hops,
+            each.stamped,
+            each.clock,
+        )
+        for at, each in enumerate(samples)
+    ]
+    if keys.count(keys[0]) == count:  # nearly always
+        yield samples
+        return
+    for _, places in groupby(range(count), keys.__getitem__):
+        yield [samples[at] for at in places]
 
 
 class Batcher:

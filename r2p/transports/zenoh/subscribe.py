@@ -230,17 +230,14 @@ class RxStream:
             and (not lengths or len(samples) == 1)
             and serial == publisher.window.next_serial
             and (first.sequence > publisher.last_received.sequence or not sequence)
-            and self.backlog.blocked is None
         ):
-            self._deliver_expected(publisher, serial, samples)
+            self._note_expected(publisher, serial, samples)
+            self._take(publisher, serial, samples)
         else:
             for number, sample in enumerate(samples, serial):
                 if self._is_new(publisher, number, sample):
                     self.last = sample if self._keeps(sample) else None
-                    if self.backlog.blocked is None:
-                        self._deliver(publisher, number, sample)
-                    else:
-                        self._queue(publisher, number, sample)
+                    self._take(publisher, number, [sample])
         return len(samples)
 
     def _keeps(self, sample: Sample) -> bool:
@@ -261,47 +258,51 @@ class RxStream:
         for sample in samples:
             sample.expires = utc + publisher.time_left.left(now, sample.stamp, sample.deadline)
 
-    def _deliver_expected(self, publisher: RemotePublisher, serial: int, samples: list[Sample]) -> None:
-        """Deliver a packet of expected messages: `_is_new` and `_deliver` for all at once, inlined for speed."""
+    def _note_expected(self, publisher: RemotePublisher, serial: int, samples: list[Sample]) -> None:
+        """Note a packet of expected messages: `_is_new` for all at once, inlined for speed."""
         self.last = last = samples[-1]
-        window, last_received, count = publisher.window, publisher.last_received, len(samples)
-        window.next_serial = serial + count & SERIAL_WRAP
+        last_received, count = publisher.last_received, len(samples)
+        publisher.window.next_serial = serial + count & SERIAL_WRAP
         publisher.sequence = last_received.sequence = last.sequence
         last_received.stamp = last.stamp
-        stats, backlog = self._stats, self.backlog
-        stats.received += count
-        stats.bytes_received += count * publisher.last_size
-        deliver = self.topic.deliver
-        for sample in samples:
-            if backlog.blocked is not None:  # by a message before it in the packet
-                self._queue(publisher, serial, sample)
-                serial += 1
-                continue
-            try:
-                sinks = deliver(sample)
-            except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
-                stats.lost.internal_error(error)
-                sinks = None
-            if sinks is not None:
-                backlog.block(publisher, serial, sample, sinks)
-            else:
-                window.until_credit -= 1
-                if not window.until_credit:
-                    self._send_credit(publisher, serial)
-            serial += 1
+        self._stats.received += count
+        self._stats.bytes_received += count * publisher.last_size
 
-    # Messages
+    # Messages: of one size, if they are several
 
-    def _deliver(self, publisher: RemotePublisher, serial: int, sample: Sample | None) -> None:
-        """Deliver a message, or wait for room for it; None is only acknowledged."""
-        if sample is None:  # of unknown size: where it may be long, with credit at once
-            self._acknowledge(publisher, serial, CREDIT_BYTES if self._long else 0)
+    def _take(self, publisher: RemotePublisher, serial: int, samples: list[Sample]) -> None:
+        """Deliver new messages, or put them behind a blocked one; events and periods overtake one that waits without a
+        limit.
+        """
+        backlog = self.backlog
+        if backlog.blocked is None:
+            self._deliver(publisher, serial, samples)
+        elif publisher.publisher_class != _NRT and backlog.holds:
+            for sample in samples:
+                for sink in self._deliver_to_topic(sample) or ():
+                    self._stats.lost.guard(sink.force, sample)
+            self._acknowledge(publisher, serial, samples)
+        elif not self._append(publisher, serial, samples):
+            self._stats.lost["receive queue full"] += len(samples)
+
+    def _deliver(self, publisher: RemotePublisher, serial: int, samples: list[Sample] | None) -> None:
+        """Deliver messages, up to one that has to wait for room; the others wait behind it. None: acknowledge one."""
+        if samples is None:  # of unknown size: where it may be long, with credit at once
+            self._acknowledge(publisher, serial, None)
             return
-        sinks = self._deliver_to_topic(sample)
-        if sinks is None:
-            self._acknowledge(publisher, serial, len(sample.data))
-        else:
-            self.backlog.block(publisher, serial, sample, sinks)
+        at, count = 0, len(samples)
+        while at < count:
+            taken = self.topic.deliver_run(samples, at)
+            if not taken:
+                sinks = self._deliver_to_topic(samples[at])
+                if sinks is not None:
+                    if at:
+                        self._acknowledge(publisher, serial, samples[:at])
+                    self.backlog.block(publisher, serial + at, samples[at:], sinks)
+                    return
+                taken = 1
+            at += taken
+        self._acknowledge(publisher, serial, samples)
 
     def _deliver_to_topic(self, sample: Sample) -> list[Sink] | None:
         """Hand a message to the topic; return the sinks without room. A message that raises is lost, and counted."""
@@ -311,25 +312,20 @@ class RxStream:
             self._stats.lost.internal_error(error)
             return None
 
-    def _queue(self, publisher: RemotePublisher, serial: int, sample: Sample) -> None:
-        """Put a message behind the blocked one; an event or a period overtakes one that waits without a limit."""
-        if publisher.publisher_class != _NRT and self.backlog.holds:
-            for sink in self._deliver_to_topic(sample) or ():
-                self._stats.lost.guard(sink.force, sample)
-            self._acknowledge(publisher, serial, len(sample.data))
-        elif not self._append(publisher, serial, sample):
-            self._stats.lost["receive queue full"] += 1
-
-    def _append(self, publisher: RemotePublisher, serial: int, sample: Sample | None) -> bool:
-        fits = self.backlog.append(publisher, serial, sample)
-        if not fits:
-            publisher.window.skip(1)  # it gets no acknowledgement of its own, so the next credit comes earlier
+    def _append(self, publisher: RemotePublisher, serial: int, samples: list[Sample] | None) -> bool:
+        fits = self.backlog.append(publisher, serial, samples)
+        if not fits:  # they get no acknowledgement of their own, so the next credit comes earlier
+            publisher.window.skip(1 if samples is None else len(samples))
         return fits
 
-    def _acknowledge(self, publisher: RemotePublisher, serial: int, size: int) -> None:
-        """Note that the queues accepted a message, and grant its publisher credit now and then."""
-        if publisher.window.accept(size):
-            self._send_credit(publisher, serial)
+    def _acknowledge(self, publisher: RemotePublisher, serial: int, samples: list[Sample] | None) -> None:
+        """Note that the queues accepted messages, and grant their publisher credit now and then."""
+        if samples is None:
+            size, count = CREDIT_BYTES if self._long else 0, 1
+        else:
+            size, count = len(samples[0].data), len(samples)
+        if publisher.window.accept(size, count):
+            self._send_credit(publisher, serial + count - 1)
 
     def _send_credit(self, publisher: RemotePublisher, serial: int) -> None:
         publisher.window.credit_sent()
@@ -352,7 +348,7 @@ class RxStream:
             self._stats.lost["repeated"] += 1
             return False
         last = publisher.last_received
-        if sequence > last.sequence:  # as `accept`, inlined: while a reader is slow, each message comes here
+        if sequence > last.sequence:  # as `accept`, inlined: each message of variable length comes here
             last.sequence, last.stamp = sequence, stamp
         elif not last.accept(sequence, stamp):
             self._drop_duplicate(publisher, serial, sequence)
@@ -391,7 +387,7 @@ class RxStream:
         if publisher.window.next_serial >= 0 and not self._advance(publisher, serial):
             return  # serials are counted from the first message that is of use
         if self.backlog.blocked is None or publisher.publisher_class != _NRT:
-            self._acknowledge(publisher, serial, CREDIT_BYTES if self._long else 0)
+            self._acknowledge(publisher, serial, None)
         else:
             self._append(publisher, serial, None)
 
@@ -403,7 +399,7 @@ class RxStream:
         else:
             publisher.sequence = sequence
             self._stats.lost["seen before"] += 1
-            self._acknowledge(publisher, serial, CREDIT_BYTES if self._long else 0)
+            self._acknowledge(publisher, serial, None)
 
     # Publishers
 

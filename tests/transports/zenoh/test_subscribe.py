@@ -286,6 +286,9 @@ class FaultyTopic(Topic):
             raise RuntimeError(sample)
         return super().deliver(sample, own, driver)
 
+    def deliver_run(self, samples: list[Sample], at: int) -> int:
+        return 0
+
 
 @pytest.mark.internal_errors
 @pytest.mark.parametrize("publisher_class", [1, 2])
