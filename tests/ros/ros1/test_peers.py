@@ -172,7 +172,7 @@ async def test_messages_go_on_without_the_master_and_new_peers_come_with_its_suc
         with own_ros1.peer("old") as old:
             await old.do("subscribe", topic="/out", type="std_msgs/String")
             await old.do("advertise", topic="/in", type="std_msgs/String")
-            await old.do("connected", topic="/out")
+            await user.until(lambda: ("subscriber joined", "/out") in user.log)  # rospy counts it before it connects
             await old.do("connected", topic="/in")
             own_ros1.close()
             await user.until(lambda: any("topics that are connected go on" in each for each in user.notices.values()))
