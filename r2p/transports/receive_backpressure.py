@@ -203,8 +203,9 @@ class LinkBackpressure(ReceiveBackpressure):
 class Backlog(ReceiveBackpressure, Generic[P]):
     """Messages that wait for room on one topic: the blocked one, and those behind it.
 
-    `deliver` gets messages that came together in their turn, of one publisher and one size, with the serial of the
-    first; and None for the blocked one when every sink has it. `resume` is called when reading may go on.
+    `deliver` gets messages of one publisher that came together in their turn, with the serial of the first; and None
+    for the blocked one when every sink has it. Several are short, as long ones come alone, and their bytes are not
+    counted. `resume` is called when reading may go on.
     """
 
     def __init__(
@@ -242,11 +243,9 @@ class Backlog(ReceiveBackpressure, Generic[P]):
 
     def _count(self, samples: list[Sample] | None, sign: int) -> None:
         """Count messages that come to the queue (1) or leave it (-1)."""
-        if samples is None:
-            self._messages += sign
-        else:
-            self._messages += sign * len(samples)
-            self._bytes += sign * len(samples) * len(samples[0].data)
+        self._messages += sign * (1 if samples is None else len(samples))
+        if samples is not None and len(samples) == 1:
+            self._bytes += sign * len(samples[0].data)
 
     def clear(self) -> int:
         """Drop everything; return how many messages waited behind the blocked one."""

@@ -224,14 +224,17 @@ class RxStream:
         if deadline:
             self._set_expiry(publisher, samples)
         first = samples[0]
-        # The hot path: the expected next message, of the same size as before. All others are checked one by one.
+        if lengths:
+            size_fits = publisher.type_fits and publisher.size < 0 and max(lengths) <= min(self._bound, UNCOUNTED_BYTES)
+        else:
+            size_fits = len(first.data) == publisher.last_size
+        # The hot path: the expected next messages, whose bytes need not be counted. All others are checked one by one.
         if (
-            len(first.data) == publisher.last_size
-            and (not lengths or len(samples) == 1)
+            size_fits
             and serial == publisher.window.next_serial
             and (first.sequence > publisher.last_received.sequence or not sequence)
         ):
-            self._note_expected(publisher, serial, samples)
+            self._note_expected(publisher, serial, samples, size)
             self._take(publisher, serial, samples)
         else:
             for number, sample in enumerate(samples, serial):
@@ -258,17 +261,17 @@ class RxStream:
         for sample in samples:
             sample.expires = utc + publisher.time_left.left(now, sample.stamp, sample.deadline)
 
-    def _note_expected(self, publisher: RemotePublisher, serial: int, samples: list[Sample]) -> None:
-        """Note a packet of expected messages: `_is_new` for all at once, inlined for speed."""
+    def _note_expected(self, publisher: RemotePublisher, serial: int, samples: list[Sample], size: int) -> None:
+        """Note a packet of expected messages with so many bytes: `_is_new` for all at once."""
         self.last = last = samples[-1]
         last_received, count = publisher.last_received, len(samples)
         publisher.window.next_serial = serial + count & SERIAL_WRAP
         publisher.sequence = last_received.sequence = last.sequence
         last_received.stamp = last.stamp
         self._stats.received += count
-        self._stats.bytes_received += count * publisher.last_size
+        self._stats.bytes_received += size
 
-    # Messages: of one size, if they are several
+    # Messages: several only if their bytes need not be counted
 
     def _take(self, publisher: RemotePublisher, serial: int, samples: list[Sample]) -> None:
         """Deliver new messages, or put them behind a blocked one; events and periods overtake one that waits without a
@@ -334,23 +337,17 @@ class RxStream:
 
     def _is_new(self, publisher: RemotePublisher, serial: int, sample: Sample) -> bool:
         """Return whether the sample is a new message of the right type; all else is counted here."""
-        size, sequence, stamp = len(sample.data), sample.sequence, sample.stamp
-        window = publisher.window
+        size, sequence = len(sample.data), sample.sequence
         if size != publisher.last_size:
             if not self._size_fits(publisher, size):
                 self._reject(publisher, serial)
                 return False
             if size <= UNCOUNTED_BYTES:
                 publisher.last_size = size
-        if serial == window.next_serial:  # `advance` inlined; where serials wrap it is called, and finds no gap
-            window.next_serial = serial + 1
-        elif not self._advance(publisher, serial):
+        if not self._advance(publisher, serial):
             self._stats.lost["repeated"] += 1
             return False
-        last = publisher.last_received
-        if sequence > last.sequence:  # as `accept`, inlined: each message of variable length comes here
-            last.sequence, last.stamp = sequence, stamp
-        elif not last.accept(sequence, stamp):
+        if not publisher.last_received.accept(sequence, sample.stamp):
             self._drop_duplicate(publisher, serial, sequence)
             return False
         publisher.sequence = sequence

@@ -509,6 +509,43 @@ async def test_lengths_that_lie_are_counted() -> None:
     assert ring.stats.lost == {"undecodable": 4}
 
 
+class CountingTopic(Topic):
+    """Notes how many messages are taken at once."""
+
+    def __init__(self, name: str, wake_scheduler: WakeScheduler) -> None:
+        super().__init__(name, wake_scheduler)
+        self.runs: list[int] = []
+
+    def deliver_run(self, samples: list[Sample], at: int) -> int:
+        taken = super().deliver_run(samples, at)
+        self.runs.append(taken)
+        return taken
+
+
+@pytest.mark.parametrize("varies", [False, True])
+async def test_messages_are_taken_in_bulk_also_behind_one_that_waits(varies: bool) -> None:
+    ring = Ring(queue=4, topic=CountingTopic, kind=Note if varies else Led)
+    assert isinstance(ring.topic, CountingTopic)
+    messages = [note("x" * number) for number in range(1, 20)]
+    for serial, count in ((1, 1), (2, 8), (10, 10)):
+        if varies:
+            ring.put_varying(serial, *messages[serial - 1 : serial - 1 + count])
+        else:
+            ring.put(serial, count)
+    taken: list[Sample] = []
+    while len(taken) < 19:
+        await turns()
+        taken += ring.sink.queue
+        ring.sink.queue.clear()
+        ring.sink.refill()
+    assert [each.sequence for each in taken] == [*range(1, 20)]
+    if varies:
+        assert [each.data for each in taken] == messages
+    assert max(ring.topic.runs) == 3  # behind the first one, or one that had to wait
+    assert (ring.stats.received, ring.stats.bytes_received) == (19, sum(len(each.data) for each in taken))
+    assert not ring.stats.lost
+
+
 async def test_what_is_too_long_is_counted_without_a_copy_and_granted_credit() -> None:
     ring = Ring(queue=20, kind=Note)
     ring.put_varying(1, note("a"))
