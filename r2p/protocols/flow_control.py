@@ -172,6 +172,8 @@ class ReceiveWindow:
         """The expected serial; -1: any."""
         self.until_credit = 1
         """Messages that the queues accept before credit is granted; the first message is answered at once."""
+        self._apart = 1
+        """Messages from the next credit to the one after it, but for `_share`: one of the first may be lost."""
         self._bytes_until_credit = CREDIT_BYTES
 
     def advance(self, serial: int) -> int:
@@ -189,7 +191,7 @@ class ReceiveWindow:
 
     def restart(self) -> None:
         """Answer the next message at once: a sender that is gone will have forgotten this receiver if it returns."""
-        self.until_credit = 1
+        self.until_credit = self._apart = 1
 
     def skip(self, count: int) -> None:
         """Count lost messages towards the next credit, so that it is in time."""
@@ -204,7 +206,8 @@ class ReceiveWindow:
 
     def credit_sent(self) -> None:
         """Start to count towards the next credit."""
-        self.until_credit = self._share
+        self.until_credit = min(self._apart, self._share)
+        self._apart = min(2 * self._apart, SHARE)
         self._bytes_until_credit = CREDIT_BYTES
 
     @property

@@ -90,22 +90,26 @@ def test_gaps_where_serials_wrap() -> None:
     assert [flow.advance(serial & 0xFFFFFFFF) for serial in (2**32 - 1, 2**32, 2**32 + 2)] == [0, 0, 1]
 
 
-def test_the_first_is_answered_at_once_then_each_quarter_of_a_window() -> None:
-    flow = ReceiveWindow(8)
-    answered = []
-    for number in range(12):
-        flow.until_credit -= 1
-        if not flow.until_credit:
+def answered(flow: ReceiveWindow, messages: int) -> list[int]:
+    """The messages, from 1, after which credit is granted."""
+    found = []
+    for number in range(1, messages + 1):
+        if flow.accept(8):
             flow.credit_sent()
-            answered.append(number)
-    assert answered == [0, 2, 4, 6, 8, 10]
+            found.append(number)
+    return found
+
+
+def test_the_first_is_answered_at_once_then_one_further_twice_as_far_then_each_quarter_of_a_window() -> None:
+    flow = ReceiveWindow(32)
+    assert answered(flow, 40) == [1, 2, 4, 8, 16, 24, 32, 40]
+    flow.restart()
+    assert answered(flow, 16) == [1, 2, 4, 8, 16]
 
 
 def test_a_lossy_one_answers_rarely() -> None:
     flow = ReceiveWindow(0)
-    flow.until_credit -= 1
-    flow.credit_sent()
-    assert flow.until_credit == SHARE
+    assert answered(flow, 3 * SHARE) == [*(1 << power for power in range(11)), 2 * SHARE, 3 * SHARE]
 
 
 def test_what_one_that_is_gone_has_not_confirmed_is_unknown() -> None:
