@@ -11,7 +11,7 @@ import pytest
 
 import r2p
 from r2p.ros import exposed_parameters
-from r2p.ros.ros1 import registration
+from r2p.ros.ros1 import parameters, registration
 from r2p.ros.ros1.master import MasterClient, MasterError
 from r2p.ros.ros1.transport import from_url
 from r2p.ros.ros1.xmlrpc import XmlRpcClient
@@ -41,6 +41,7 @@ def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("MODULES_PERIOD_S", "_OWN_PERIOD_S", "_REMOTE_PERIOD_S"):
         monkeypatch.setattr(exposed_parameters, name, 0.05)
     monkeypatch.setattr(registration, "POLL_S", 0.1)
+    monkeypatch.setattr(parameters, "_CLOSE_S", 30.0)  # a busy master may take long
 
 
 @pytest.fixture
