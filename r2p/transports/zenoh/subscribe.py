@@ -295,7 +295,7 @@ class RxStream:
             return
         at, count = 0, len(samples)
         while at < count:
-            taken = self.topic.deliver_run(samples, at)
+            taken = self.topic.deliver_run(samples, at) if count - at > 1 else 0
             if not taken:
                 sinks = self._deliver_to_topic(samples[at])
                 if sinks is not None:
