@@ -155,7 +155,8 @@ async def test_clients_come_and_go_without_a_trace() -> None:
             traces.append(traces_of_links())
             assert not publisher.subscribers
             assert not module.space.links
-        assert traces[0] == traces[1] == traces[2]
+        for later in traces[1:]:  # fewer files: what another test has left is gone
+            assert all(now <= before for now, before in zip(later, traces[0], strict=True)), traces
 
 
 def traces_of_links() -> tuple[int, int, int]:

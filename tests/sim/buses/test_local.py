@@ -92,10 +92,11 @@ def test_an_attachment_that_its_loop_did_not_answer_is_not_made_later(monkeypatc
     asyncio.run(block_while_another_thread_attaches("blocked"))
 
 
-async def close_while_the_loop_stands_still(channel: str) -> None:
+async def close_while_the_loop_stands_still(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     shared = r2p.sim.can_bus(channel)
     attachment = await asyncio.to_thread(attach_here, channel, OPTIONS)
     assert attachment is not None
+    monkeypatch.setattr(local, "_ANSWER_S", 0.01)  # now: before, the loop answers, which may take longer
     thread = threading.Thread(target=attachment.close)
     thread.start()
     thread.join()
@@ -105,8 +106,7 @@ async def close_while_the_loop_stands_still(channel: str) -> None:
 
 
 def test_a_node_leaves_as_soon_as_its_loop_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local, "_ANSWER_S", 0.01)
-    asyncio.run(close_while_the_loop_stands_still("still"))
+    asyncio.run(close_while_the_loop_stands_still("still", monkeypatch))
 
 
 class AppendedMeanwhile(deque[AnyFrame]):
