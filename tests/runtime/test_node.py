@@ -236,7 +236,7 @@ async def test_no_ticker_outlives_its_node() -> None:
             await asyncio.sleep(0)
             await asyncio.sleep(0)
             await module.nodes["late"].stop()
-            assert open_files() == before
+            assert open_files() <= before  # what another test has left may be gone meanwhile
 
     assert len(await crashes(main)) == 1
 
