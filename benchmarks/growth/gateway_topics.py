@@ -3,8 +3,8 @@
 Firmware on one TCP connection sends N topics at 100 Hz. Each of 20 modules on zenoh subscribes to a part of them, goes
 after some seconds, and comes again. All messages have the number and the instant at which they were sent.
 
-What the gateway adds is seen by a bare zenoh subscriber: it takes one of the topics, and another one that the same
-process sends to a bare relay of the two links, with the same machine as busy.
+What the gateway adds is seen by a bare zenoh subscriber. It takes one of the topics, and another one that the firmware
+sends through a bare relay between the same two links, at the same time on the same busy machine.
 """
 
 import asyncio

@@ -234,7 +234,10 @@ class Backlog(ReceiveBackpressure, Generic[P]):
             self._count(samples[1:], 1)
 
     def append(self, publisher: P, serial: int, samples: list[Sample] | None) -> bool:
-        """Append messages; return False if there is no room. None stands for one that is only acknowledged."""
+        """Append messages, or return False if there is no room.
+
+        `samples` is None for a single message that only has to be acknowledged in its turn.
+        """
         if self._messages >= BACKLOG_MAX or self._bytes >= BACKLOG_BYTES_MAX:
             return False
         self._queue.append((publisher, serial, samples))

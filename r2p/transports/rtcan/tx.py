@@ -287,7 +287,7 @@ class Transmitter:
 
     @property
     def full(self) -> bool:
-        """Return whether there is no room for messages that do not expire."""
+        """Return whether messages without a deadline have to wait for room."""
         return self._frames >= NRT_FRAMES_MAX
 
     def has_room_for(self, sample: Sample) -> bool:

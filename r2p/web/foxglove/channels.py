@@ -146,7 +146,7 @@ class ChannelTable:
         self._numbers = 0
 
     def review(self, views: Mapping[str, TopicView]) -> None:
-        """Add the topics that are published, and remove those that are not any more."""
+        """Add newly published topics, and remove those that are no longer published."""
         self._wanted = {name for name, view in views.items() if view.published_on and _is_shown(name, views)}
         for name in self._by_topic.keys() - self._wanted:
             self._remove(name)

@@ -360,7 +360,7 @@ class _Instant:
             )
 
     def _age(self, module: str) -> float:
-        """Return the seconds since the last message of a module; NaN, which JSON has as null, if there is none."""
+        """Return how many seconds ago a module was last heard; NaN (null in JSON) if it never was."""
         answer = self._answers.get(module)
         heard = max(self._heard.get(module, 0), answer.time if answer is not None else 0)
         return (self._time - heard) / SECOND if heard else math.nan

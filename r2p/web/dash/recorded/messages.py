@@ -65,7 +65,7 @@ class WatchedTopic:
         return await self._reader.run(partial(self._news, bag.files[number].channels[record[1]], record))
 
     def _nothing(self) -> dict[str, Any] | None:
-        """Return what takes the place of a message that was shown, where there is none yet."""
+        """Return an empty message to replace the one on the page, or None if the page shows none."""
         if self._shown is None:
             return None
         self._shown = None

@@ -300,7 +300,7 @@ class _Observed:
         return found
 
     def finish(self) -> None:
-        """Enter the misses that were logged at the end, and that no module has counted any more."""
+        """Enter the last misses of the log, for which no statistics of their modules follow."""
         for each in self._uncounted.values():
             self._scan.enter(each)
 
