@@ -33,17 +33,17 @@ from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
 RING = 4096
 """Packets of one topic that zenoh keeps; of more, it loses the oldest."""
 
-_RING_MIN = 64  # ... where messages may be long: two packets of one publisher are on the way, or 192 kB of short ones
+_RING_MIN = 64  # ... where messages may be long
 _RING_BYTES = 64 << 20  # bytes of those, if all were as long as the topic's messages may be
 _RING_UNKNOWN = 512  # ... without a type, when all that is known of the messages is that they have 64 MiB at most
 
-WINDOW = 2048
-"""Messages of one publisher on the way to one subscriber's module, at most."""
+WINDOW = RING // 2
+"""Messages of one publisher on the way to one subscriber's module, at most: zenoh keeps two windows of short ones, each
+in a packet of its own.
+"""
 
-_WINDOW_MIN = 32  # ... where zenoh keeps few packets, as messages may be very long
 _WINDOW_BYTES = 192 * 1024  # bytes of all but long ones, which the publisher limits: five topics fit into 1 MB
 _UNKNOWN_SIZE = 1024  # bytes that the messages of a topic without a type are expected to have, at most
-_LONGEST_IN_WINDOW = _RING_BYTES // 512  # zenoh keeps two windows of short ones, each in a packet of its own
 _OVERHEAD = 32  # bytes of a message besides its payload, in a packet of several: its stamp and its share of the header
 _FINAL_CREDITS_MAX = 256  # sessions that learn that a topic is no longer subscribed to; older ones may be long gone
 _SENDERS_MAX = 4096  # senders whose serials a stream remembers, and topics whose serials outlast an outage
@@ -466,7 +466,7 @@ class ZenohReceiver:
     def _start_reading(self, stream: RxStream) -> None:
         if self._session is not None:
             key = f"{self._prefix}/topic/{stream.topic.name}"
-            stream.reader = self._session.subscribe(key, _ring(stream.topic), stream.on_packet)
+            stream.reader = self._session.subscribe(key, _ring_of(stream.topic), stream.on_packet)
 
     def send_credit(
         self, topic: str, session: int, publisher_class: PublisherClass, serial: int, *, leaving: bool = False
@@ -505,9 +505,7 @@ class ZenohReceiver:
         size = _UNKNOWN_SIZE if topic.layout is None else topic.layout.size
         if topic.accepted:
             size = max(each.size for each in topic.accepted)
-        if size > _LONGEST_IN_WINDOW:
-            return _WINDOW_MIN
-        return min(WINDOW, _WINDOW_BYTES // (min(size, UNCOUNTED_BYTES) + _OVERHEAD))
+        return min(_ring(size) // 2, _WINDOW_BYTES // (min(size, UNCOUNTED_BYTES) + _OVERHEAD))
 
     # Publishers
 
@@ -572,11 +570,13 @@ def _split(payload: zenoh.ZBytes, count: int, lengths: tuple[int, ...], bound: i
     return [data] if count == 1 else [data[at:end] for at, end in zip([0, *ends], ends, strict=False)]
 
 
-def _ring(topic: Topic) -> int:
+def _ring_of(topic: Topic) -> int:
     """Return how many packets zenoh keeps for a topic."""
-    if topic.layout is None:
-        return _RING_UNKNOWN
-    size = topic.layout.size
+    return _RING_UNKNOWN if topic.layout is None else _ring(topic.layout.size)
+
+
+def _ring(size: int) -> int:
+    """Return how many packets zenoh keeps of messages that have so many bytes at most."""
     return RING if size * RING <= _RING_BYTES else max(_RING_MIN, _RING_BYTES // size)
 
 

@@ -33,6 +33,12 @@ class Note(r2p.Message):
     text: Annotated[str, r2p.Max(96)] = ""
 
 
+class Scan(r2p.Message):
+    """250 kB, of which zenoh keeps as many as fit into 64 MiB."""
+
+    data: Annotated[bytes, r2p.Max(250_000)] = b""
+
+
 class Long(r2p.Message):
     """The same, with another bound."""
 
@@ -615,7 +621,9 @@ async def test_what_waits_for_a_slow_subscriber_is_limited_in_bytes(monkeypatch:
 
 
 @pytest.mark.parametrize(
-    ("kind", "window"), [(Led, WINDOW), (Note, 1489), (Long, 32), (None, 186)], ids=["short", "varies", "long", "raw"]
+    ("kind", "window"),
+    [(Led, WINDOW), (Note, 1489), (Scan, 134), (Long, 33), (None, 186)],
+    ids=["short", "varies", "medium", "long", "raw"],
 )
 async def test_the_window_follows_from_the_bound(kind: type[r2p.Message] | None, window: int) -> None:
     """It is never 0: that would be no flow control."""
