@@ -176,8 +176,12 @@ class BridgedTopic(Topic):
         return own if self.reserved is None else [*own, self.reserved]
 
     @property
+    def is_relayed(self) -> bool:
+        return self.relayed is not None
+
+    @property
     def wanted(self) -> bool:
-        return self.relayed is not None or bool(self.queues)
+        return self.is_relayed or bool(self.queues)
 
     @property
     def in_use(self) -> bool:

@@ -84,6 +84,8 @@ class MessageIdMap:
         size, varies = found.bound if found.varies else found.size, found.varies
         if (layout := topic.received_layout) is not None:
             size, varies = layout.size, layout.varies
+        if not (size or varies or found.source == FIRMWARE):
+            return  # a gateway that has forgotten the type with its last publisher: the next one says its size
         message_id = management.rtcan_message_id(found.params)
         possible = varies or 1 <= size <= rtcan.PAYLOAD_MAX
         if not (possible and self._plausible(message_id, found.source)):
