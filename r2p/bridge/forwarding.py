@@ -9,20 +9,21 @@ gateway that was stopped must not go on with an old tree. Messages that arrive w
 and forwarded if it may forward afterwards.
 """
 
+import asyncio
 import functools
 from collections import Counter, deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from r2p.bridge.options import RelayedPeriodic, Shaper
 from r2p.log_lines import LineLimit
 from r2p.protocols.bridge.ports import PortState, TreePort
-from r2p.runtime.backpressure import Sink
+from r2p.runtime.backpressure import PendingDelivery, Sink
 from r2p.runtime.queues import SubscriberQueue, WakeScheduler
 from r2p.runtime.sample import DuplicateFilter, LastReceived, PublisherClass, Sample
 from r2p.runtime.topic import RemoteSubscriber, SlotPublisher, Topic
 from r2p.transports.link import Link
-from r2p.units import LONG_AGO
+from r2p.units import LONG_AGO, SECOND
 
 if TYPE_CHECKING:
     from r2p.protocols.discovery.events import TopicType
@@ -33,6 +34,10 @@ HOPS_MAX = 15
 HELD_MAX = 4096
 """Places for held messages."""
 
+READY = SECOND
+"""For how long messages wait for a link to serve a new subscriber (ns)."""
+
+_NOT_SUBSCRIBED = "not subscribed"
 _PLACE = 16 * 1024
 """Bytes of a message in each place: so held messages have 64 MiB at most, and one message more."""
 
@@ -96,7 +101,7 @@ def by_kind(ports: list[BridgePort]) -> PortsByKind:
 
 
 class HeldMessages:
-    """Messages that wait until the gateway may forward again, and how to go on with each."""
+    """Messages that wait until they can be forwarded, and how to go on with each."""
 
     def __init__(self) -> None:
         self._held: deque[tuple[Sample, Callable[[], list[Sink] | None]]] = deque()
@@ -106,32 +111,43 @@ class HeldMessages:
         return bool(self._held)
 
     def hold(self, sample: Sample, go_on: Callable[[], list[Sink] | None]) -> bool:
-        """Hold a message; return False if it expires or there are too many. `go_on` returns the sinks without room."""
-        # Events and periods are of no use later.
-        if sample.publisher_class != PublisherClass.NON_REAL_TIME or self._places >= HELD_MAX:
+        """Hold a message; return False if there are too many. `go_on` returns the sinks without room."""
+        if self._places >= HELD_MAX:
             return False
         self._places += 1 + len(sample.data) // _PLACE
         self._held.append((sample, go_on))
         return True
 
-    def release(self, failed: Callable[[Exception], object]) -> None:
-        """Go on with all messages; `failed` is called with exceptions."""
-        held, self._held, self._places = self._held, deque(), 0
-        for sample, go_on in held:
+    def release(self, failed: Callable[[Exception], object], *, but: Sequence[Sample] = ()) -> None:
+        """Go on with all messages but these; `failed` is called with exceptions."""
+        for sample, go_on in self._take():
+            if any(sample is each for each in but):
+                continue
             try:
-                for sink in go_on() or ():
-                    sink.force(sample)
+                if sinks := go_on():
+                    PendingDelivery(sample, sinks)
             except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
                 failed(error)
+
+    def drop(self) -> list[Sample]:
+        """Give up all messages; return them."""
+        return [sample for sample, _ in self._take()]
+
+    def _take(self) -> deque[tuple[Sample, Callable[[], list[Sink] | None]]]:
+        held, self._held, self._places = self._held, deque(), 0
+        return held
 
 
 class Route:
     """One topic from one link to another: `subscriber` is set while it is subscribed there.
 
     `shaper` changes messages on this route, or drops some; None: they pass as they are.
+
+    Publishers know of a new subscriber at once, while its link may first have to tell it what to receive, or to see
+    that messages reach it. Until then, but at most until `ready_by` (monotonic ns), messages are `held`.
     """
 
-    __slots__ = ("dropped", "forwarded", "port", "shaper", "subscriber", "target")
+    __slots__ = ("dropped", "forwarded", "held", "port", "ready_by", "shaper", "subscriber", "target")
 
     def __init__(self, port: BridgePort, target: "BridgedTopic", shaper: Shaper | None) -> None:
         self.port = port
@@ -141,6 +157,8 @@ class Route:
         self.forwarded = 0
         self.dropped: Counter[str] = Counter()
         """Losses by reason; the link counts only those due to the tree (`converging`)."""
+        self.ready_by = LONG_AGO
+        self.held: HeldMessages | None = None
 
 
 class BridgedTopic(Topic):
@@ -176,12 +194,8 @@ class BridgedTopic(Topic):
         return own if self.reserved is None else [*own, self.reserved]
 
     @property
-    def is_relayed(self) -> bool:
-        return self.relayed is not None
-
-    @property
     def wanted(self) -> bool:
-        return self.is_relayed or bool(self.queues)
+        return self.relayed is not None or bool(self.queues)
 
     @property
     def in_use(self) -> bool:
@@ -200,7 +214,7 @@ class BridgedTopic(Topic):
         now = self._monotonic()
         port = self._ports[link]
         if now >= port.tree_port.forwards_until:
-            if not (port.resumes and self._held.hold(sample, functools.partial(self._deliver_held, port, sample))):
+            if not self._hold(port, sample, functools.partial(self._deliver_held, port, sample)):
                 port.count_dropped("converging")
             return None
         # A latched value arrives again, unchanged, for each new subscriber.
@@ -210,10 +224,10 @@ class BridgedTopic(Topic):
         routes = self.active_routes.get(link)
         if not routes:
             if routes is None:
-                routes = [] if self.relayed is None else self.relayed.active_from(link)
+                routes = [] if self.relayed is None else self.relayed.active_from(link, now)
                 self.active_routes[link] = routes
-            if not routes and not self.queues:  # not yet, or no longer, which its publisher will soon know: no loss
-                port.dropped["not subscribed"] += 1
+            if not routes and not self.queues:
+                self._drop_unsubscribed(sample)
                 return None
         blocked = super().deliver(sample) if self.queues else None
         for route in routes:
@@ -224,6 +238,11 @@ class BridgedTopic(Topic):
         """Queue nothing in bulk: each message is looked at, and forwarded."""
         return 0
 
+    def _hold(self, port: BridgePort, sample: Sample, go_on: Callable[[], list[Sink] | None]) -> bool:
+        """Hold a message while its port pauses; return False if it does not, or if the message is of no use later."""
+        non_real_time = sample.publisher_class == PublisherClass.NON_REAL_TIME
+        return non_real_time and port.resumes and self._held.hold(sample, go_on)
+
     def _deliver_held(self, port: BridgePort, sample: Sample) -> list[Sink] | None:
         if self._ports.get(port.name) is port:
             return self.deliver(sample)
@@ -231,26 +250,48 @@ class BridgedTopic(Topic):
         return None
 
     def _forward(self, route: Route, sample: Sample, now: int, blocked: list[Sink] | None) -> list[Sink] | None:
-        port = route.port
+        port, subscriber = route.port, route.subscriber
+        if subscriber is None:
+            self._await_subscriber(route, sample, now)
+            return blocked
         if now >= port.tree_port.forwards_until:
-            if not (port.resumes and self._held.hold(sample, functools.partial(self._forward_held, route, sample))):
+            if not self._hold(port, sample, functools.partial(self._forward_held, route, sample)):
                 route.dropped["converging"] += 1
                 port.link.stats.lost["converging"] += 1
             return blocked
         shaper = route.shaper
         if shaper is None and not sample.deadline and sample.hops < HOPS_MAX:  # most messages: nothing else to ask
-            return _offer(route, sample, blocked)
+            return _offer(route, subscriber, sample, blocked)
         if sample.hops >= HOPS_MAX:
             route.dropped["too many hops"] += 1
         elif sample.deadline and sample.drop_late and port.now() > sample.due and not self._is_latched(sample):
             route.dropped["late"] += 1
         elif shaper is None:
-            return _offer(route, sample, blocked)
+            return _offer(route, subscriber, sample, blocked)
         elif shaper.reserved is not None and shaper.reserved.offer(sample):
             route.forwarded += 1
         else:
-            return _offer_shaped(route, shaper.shape(sample, now, port.now()), sample, blocked)
+            return _offer_shaped(route, subscriber, shaper.shape(sample, now, port.now()), sample, blocked)
         return blocked
+
+    def _await_subscriber(self, route: Route, sample: Sample, now: int) -> None:
+        """Hold a message for a link that will soon serve its new subscriber; drop it if there is none."""
+        if route.held is None and now < route.ready_by:
+            route.held = HeldMessages()
+            asyncio.get_running_loop().call_later((route.ready_by - now) / SECOND, self._give_up, route, route.held)
+        if route.held is None or not route.held.hold(sample, functools.partial(self._forward_held, route, sample)):
+            self._drop_unsubscribed(sample)
+
+    def _give_up(self, route: Route, held: HeldMessages) -> None:
+        if route.held is held:
+            route.held = None
+            for sample in held.drop():
+                self._drop_unsubscribed(sample)
+
+    def _drop_unsubscribed(self, sample: Sample) -> None:
+        """Count a message that no other link wants yet, or no longer, which its publisher will soon know: no loss."""
+        if (port := self._ports.get(sample.source.link)) is not None:
+            port.dropped[_NOT_SUBSCRIBED] += 1
 
     def _is_latched(self, sample: Sample) -> bool:
         """Return whether a message may be a latched value, which is worth sending however old it is."""
@@ -258,7 +299,7 @@ class BridgedTopic(Topic):
         return source is not None and source.link.latched(self.name)
 
     def _forward_held(self, route: Route, sample: Sample) -> list[Sink] | None:
-        return None if route.subscriber is None else self._forward(route, sample, self._monotonic(), None)
+        return self._forward(route, sample, self._monotonic(), None)
 
     def _send(
         self, subscribers: list[RemoteSubscriber], sample: Sample, blocked: list[Sink] | None, slot_link: object
@@ -268,7 +309,7 @@ class BridgedTopic(Topic):
         silent = [each for each in subscribers if now >= self._ports[each.link_name].tree_port.forwards_until]
         for each in silent:
             port = self._ports[each.link_name]
-            if not (port.resumes and self._held.hold(sample, functools.partial(self._send_held, each, sample))):
+            if not self._hold(port, sample, functools.partial(self._send_held, each, sample)):
                 each.lost += 1
                 port.count_dropped("converging")
         if silent:
@@ -297,6 +338,7 @@ class BridgedTopic(Topic):
             self.by_link[sink.link] = sink
             if self.relayed is not None:
                 self.relayed.subscriber_changed(self, sink)
+                self.relayed.release_held(sink)
         super().join(sink)  # which ends with `resend_latched`
 
     def leave(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
@@ -357,9 +399,10 @@ class RelayedTopic:
         """Return the route from one link to another, if there is one."""
         return self._from.get(source, {}).get(target)
 
-    def active_from(self, source: str) -> list[Route]:
-        """Return the routes that messages from a link take now."""
-        return [route for route in self._from.get(source, {}).values() if route.subscriber is not None]
+    def active_from(self, source: str, now: int) -> list[Route]:
+        """Return the routes that messages from a link take now, or may soon take."""
+        routes = self._from.get(source, {}).values()
+        return [route for route in routes if route.subscriber is not None or now < route.ready_by]
 
     def add(self, source: str, route: Route) -> None:
         """Add a route; no message takes it before `changed` is called."""
@@ -402,14 +445,20 @@ class RelayedTopic:
         for route in self._into.get(subscriber.link_name, {}).values():
             if route.target is topic and route.port.link is subscriber.link:
                 route.subscriber = now
+                route.ready_by = LONG_AGO
         self.changed()
 
+    def release_held(self, subscriber: RemoteSubscriber) -> None:
+        """Forward what waited for a link that has joined a topic, but for values that it will get as latched ones."""
+        latched = [sample for topic in self.topics.values() for sample in topic.latched_values()]
+        for route in list(self._into.get(subscriber.link_name, {}).values()):
+            if route.subscriber is subscriber and route.held is not None:
+                held, route.held = route.held, None
+                held.release(subscriber.link.stats.lost.internal_error, but=latched)
 
-def _offer(route: Route, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:
+
+def _offer(route: Route, subscriber: RemoteSubscriber, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:
     """Send a message; return the sinks without room, and this sink if its publisher has to wait for it."""
-    subscriber = route.subscriber
-    if subscriber is None:  # it has left while the message was on its way through the routes
-        return blocked
     route.forwarded += 1
     # `Sink.offer_in_order`, inlined as in `Topic._send`: each message that a gateway forwards passes here.
     waiting = subscriber.wait_queue
@@ -422,12 +471,14 @@ def _offer(route: Route, sample: Sample, blocked: list[Sink] | None) -> list[Sin
     return [subscriber] if blocked is None else [*blocked, subscriber]
 
 
-def _offer_shaped(route: Route, shaped: Sample | None, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:
+def _offer_shaped(
+    route: Route, subscriber: RemoteSubscriber, shaped: Sample | None, sample: Sample, blocked: list[Sink] | None
+) -> list[Sink] | None:
     if shaped is sample:
-        return _offer(route, sample, blocked)
+        return _offer(route, subscriber, sample, blocked)
     if shaped is None:
         route.dropped["rate limit"] += 1
         return blocked
-    for sink in _offer(route, shaped, None) or ():
+    for sink in _offer(route, subscriber, shaped, None) or ():
         sink.force(shaped)  # it must not wait: the link would offer the message that came in, not the one shaped here
     return blocked

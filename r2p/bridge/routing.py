@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 
 import msgspec
 
-from r2p.bridge.forwarding import BridgedTopic, BridgePort, PortsByKind, RelayedTopic, Route, by_kind
+from r2p.bridge.forwarding import READY, BridgedTopic, BridgePort, PortsByKind, RelayedTopic, Route, by_kind
 from r2p.bridge.options import Policy, RelayedPeriodic, Shaper
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.log_lines import LineLimit, get_logger
@@ -176,10 +176,15 @@ class RoutingTable:
             self._allowed_pairs(topic, by_kind(new), by_kind(subscribed_on)),
             self._allowed_pairs(topic, by_kind(old), by_kind(added)),
         )
+        ready_by = self._space.clock.monotonic() + READY
         for source, target in pairs:
-            if relayed.route(source.name, target.name) is None:
+            route = relayed.route(source.name, target.name)
+            if route is None:
                 shaper = self._shaper(topic, source, target)
-                relayed.add(source.name, Route(target, self._topic(topic, target), shaper))
+                route = Route(target, self._topic(topic, target), shaper)
+                relayed.add(source.name, route)
+            if route.subscriber is None:
+                route.ready_by = ready_by
         relayed.routes_added(published_on, subscribed_on)
         if new or added:
             relayed.changed()

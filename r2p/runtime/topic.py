@@ -296,11 +296,6 @@ class Topic:
         return [each for each in self.publishers if isinstance(each, SlotPublisher)]
 
     @property
-    def is_relayed(self) -> bool:
-        """Return whether publishers on other links send to this topic's subscribers, through a gateway."""
-        return False
-
-    @property
     def wanted(self) -> bool:
         """Return whether links are to receive the topic."""
         return bool(self.queues)

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
+from r2p.codecs.can_bits import Frame
 from r2p.msg import Led
 from r2p.sim import SimCan
+from r2p.sim.can import CanNode
 from r2p.testing.network import node_in
 from r2p.transports.memory import MemoryNetwork
 
@@ -86,15 +88,33 @@ async def test_what_waits_for_an_answer_that_does_not_get_through_is_counted() -
         await asyncio.sleep(_SEEN)
         subscriber = far.subscribe("leds", Led, queue=10)
         await publisher.wait_subscriber()
-        lab.can.bus.noise = 1.0
+        broken = lab.can.bus.attach(CanNode("broken"))
+        broken.babble(Frame(0, bytes(8)))  # before all others, without a pause
+        for number in range(3):
+            await publisher.publish(Led(led=number))
+        await asyncio.sleep(0.9)
+        assert not lab.lost()
+        await asyncio.sleep(0.2)
+        assert lab.lost() == {"not subscribed": 3}
+        lab.can.bus.detach(broken)
+        await asyncio.sleep(_AGREED)
+        await publisher.publish(Led(led=3))
+        assert (await subscriber.fetch(timeout=1.0)).led == 3
+
+
+@pytest.mark.parametrize("latch", [False, True])
+async def test_each_arrives_once_also_if_the_last_one_is_latched(latch: bool) -> None:
+    lab = Lab()
+    async with lab.modules(further=False) as (a, b), node_in(a) as near, node_in(b) as far:
+        publisher = near.advertise("leds", Led, latch=latch)
+        await asyncio.sleep(_SEEN)
+        subscriber = far.subscribe("leds", Led, queue=10)
+        await publisher.wait_subscriber()
         for number in range(3):
             await publisher.publish(Led(led=number))
         await asyncio.sleep(_SEEN)
-        lab.can.bus.noise = 0.0
-        assert lab.lost() == {"link down": 3}
-        await asyncio.sleep(_AGREED)  # the answer is repeated
-        await publisher.publish(Led(led=3))
-        assert (await subscriber.fetch(timeout=1.0)).led == 3
+        assert [Led.decode(each.data).led for each in subscriber.queue] == [0, 1, 2]
+        assert not lab.lost()
 
 
 async def test_a_type_that_goes_with_its_last_publisher_is_no_loss_at_the_next_gateway() -> None:

@@ -344,19 +344,15 @@ class RtcanLink(BufferedLink):
             self._hold_discovery()
 
     def _add_subscriber(self, name: str) -> None:
-        topic = self._space.topics.get(name)
-        if topic is not None and topic.is_relayed and name not in self._subscribers:
-            self._transmitter.hold_until_response(name)  # publishers on other links know of the subscriber already
-        elif self._transmitter.waits_for_response(name):
-            return
-        super()._add_subscriber(name)
+        if not self._transmitter.waits_for_response(name):
+            super()._add_subscriber(name)
 
     def _remove_subscriber(self, name: str) -> None:
         self._transmitter.remove_topic(name)
         super()._remove_subscriber(name)
 
     def _has_subscribers(self, topic: str) -> bool:
-        return self.up and topic in self._subscribers and not self._transmitter.holds(topic)
+        return self.up and topic in self._subscribers
 
     def _done(self, done: Done) -> None:
         match done.handle:

@@ -265,13 +265,6 @@ class ResponseHandle(msgspec.Struct, eq=False):
     data: bytes
 
 
-class _HeldSamples(msgspec.Struct, eq=False):
-    """Samples of a topic whose first subscriber waits for `response`, each as `Engine.publish` gets it."""
-
-    response: ResponseHandle
-    samples: list[tuple[int, bytes, int, bool, SampleHandle]] = []
-
-
 class Transmitter:
     """Passes a link's messages to the engine, counts them there, and reports late and lost ones."""
 
@@ -285,8 +278,7 @@ class Transmitter:
         self._messages = 0  # soft real-time ones in the engine
         self._responses: dict[bytes, ResponseHandle] = {}  # in the engine
         self._response: ResponseHandle | None = None  # the last one, until it is on the bus
-        self._awaited: dict[str, ResponseHandle] = {}  # by topic: the response that a further subscriber needs first
-        self._held: dict[str, _HeldSamples] = {}  # by topic
+        self._awaited: dict[str, ResponseHandle] = {}  # by topic: the response that its subscribers need first
 
     @property
     def pending(self) -> bool:
@@ -321,9 +313,6 @@ class Transmitter:
         self._stats.sent += 1
         self._stats.bytes_sent += len(sample.data)
         handle = SampleHandle(topic, publisher, frames, deadline)
-        if (held := self._held.get(topic)) is not None:
-            held.samples.append((high, data, deadline, sample.drop_late, handle))
-            return ()
         return self._engine.publish(now, high, data, deadline=deadline, drop=sample.drop_late, handle=handle)
 
     def completed(self, handle: SampleHandle, done: Done) -> None:
@@ -354,48 +343,29 @@ class Transmitter:
             data = management.mark(data)
         return self._engine.manage(self._driver.now(), data, urgent=urgent, handle=handle)
 
-    def hold_until_response(self, topic: str) -> None:
-        """Hold the samples of a topic with a first subscriber until the last response is on the bus.
+    def waits_for_response(self, topic: str) -> bool:
+        """Return whether a topic has to wait until the last response is on the bus.
 
         A message with little laxity would overtake the response, and its subscriber does not know the id before.
         """
-        if self._response is not None:
-            self._held[topic] = _HeldSamples(self._response)
-
-    def holds(self, topic: str) -> bool:
-        """Return whether the samples of a topic are held."""
-        return topic in self._held
-
-    def waits_for_response(self, topic: str) -> bool:
-        """Return whether a further subscriber of a topic has to wait likewise; its messages go on to the others."""
         if self._response is None:
             return False
         self._awaited[topic] = self._response
         return True
 
     def response_sent(self, response: ResponseHandle) -> list[str]:
-        """Note that a response is on the bus, or lost, and send what was held for it. Return the topics with further
-        subscribers that waited for it.
-        """
+        """Note that a response is on the bus, or lost. Return the topics that waited for it."""
         self._responses.pop(response.data, None)
         if response is self._response:
             self._response = None
-        for topic in [topic for topic, held in self._held.items() if held.response is response]:
-            self._release(topic)
         topics = [topic for topic, awaited in self._awaited.items() if awaited is response]
         for topic in topics:
             del self._awaited[topic]
         return topics
 
     def remove_topic(self, topic: str) -> None:
-        """Wait no longer for a topic that has lost its subscribers."""
+        """Stop a topic's wait, as it has lost its subscribers."""
         self._awaited.pop(topic, None)
-        self._release(topic)
-
-    def _release(self, topic: str) -> None:
-        held, now = self._held.pop(topic, None), self._driver.now()
-        for high, data, deadline, drop, handle in [] if held is None else held.samples:
-            self._driver.carry_out(self._engine.publish(now, high, data, deadline=deadline, drop=drop, handle=handle))
 
     def _report_missed(self, handle: SampleHandle, done: Done) -> None:
         publisher, late = handle.publisher, max(0, done.at - handle.deadline) / SECOND
