@@ -454,7 +454,7 @@ class RelayedTopic:
         for route in list(self._into.get(subscriber.link_name, {}).values()):
             if route.subscriber is subscriber and route.held is not None:
                 held, route.held = route.held, None
-                held.release(subscriber.link.stats.lost.internal_error, but=latched)
+                held.release(route.port.link.stats.lost.internal_error, but=latched)
 
 
 def _offer(route: Route, subscriber: RemoteSubscriber, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:
