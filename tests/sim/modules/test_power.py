@@ -256,4 +256,4 @@ async def test_it_leaves_nothing_open() -> None:
             async with pc(f"tcp:{host}:{port}") as module:
                 await module.start(hold).subscribe("leds", Led).fetch()
         open_after.append(descriptors())
-    assert open_after[1] == open_after[2]
+    assert open_after[2] <= open_after[1]  # what another test has left may be gone meanwhile
