@@ -66,6 +66,15 @@ def knows(publisher: r2p.Publisher[Any], node: r2p.Node) -> bool:
     )
 
 
+async def waits_for_credit(publisher: r2p.Publisher[Any]) -> None:
+    """Wait until a publisher waits for its subscriber, who does not read."""
+    await until(lambda: publisher.sent > WINDOW // 2)
+    stuck = -1
+    while stuck != publisher.sent:
+        stuck = publisher.sent
+        await asyncio.sleep(0.05)
+
+
 @guarded
 async def test_a_slow_subscriber_slows_its_publisher_and_loses_nothing() -> None:
     total = 4 * WINDOW
@@ -79,12 +88,8 @@ async def test_a_slow_subscriber_slows_its_publisher_and_loses_nothing() -> None
                 await publisher.publish(r2p.msg.Float32(float(number)))
 
         sending = asyncio.create_task(send())
-        await until(lambda: publisher.sent > WINDOW // 2)
-        stuck = -1
-        while stuck != publisher.sent:  # until it waits for its subscriber, who does not read
-            stuck = publisher.sent
-            await asyncio.sleep(0.05)
-        assert stuck <= WINDOW + 1 + subscriber._sink.limit
+        await waits_for_credit(publisher)
+        assert publisher.sent <= WINDOW + 1 + subscriber._sink.limit
         for number in range(total):
             assert (await subscriber.fetch()).data == number
         await sending
@@ -113,7 +118,7 @@ async def test_what_waits_for_credit_when_the_link_goes_down_is_counted() -> Non
         remote = publisher._topic.remote_subscribers[0]
         assert isinstance(remote, ZenohSubscriber)
         await until(lambda: len(subscriber.queue) == subscriber._sink.limit and not remote.unacknowledged())
-        await until(lambda: bool(remote.wait_queue.non_real_time))  # as its subscriber does not read: no credit comes
+        await waits_for_credit(publisher)
         await cable.cut()
         await sending
         assert link.losses["link down"] > 0
