@@ -230,8 +230,12 @@ class _Signals:
         return not self.received
 
     def _interrupt(self, number: int, _frame: FrameType | None) -> None:
-        for each in self._before:
-            signal.signal(each, signal.SIG_DFL)  # the second signal ends the process
+        # The second signal ends the process. Only this one's handler is reset: with that of another signal which has
+        # arrived meanwhile, and waits for Python, it would be ignored.
+        signal.signal(number, signal.SIG_DFL)
+        if self.received:
+            os.kill(os.getpid(), number)
+            return
         self.received.append(number)
         self._over.set()
         with contextlib.suppress(RuntimeError):  # the loop is closed: the program has ended by itself

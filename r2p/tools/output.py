@@ -57,6 +57,8 @@ class Output:
         self, format: Literal["text", "yaml", "json", "csv"] | None = None, stream: TextIO | None = None
     ) -> None:
         self._stream = stream or sys.stdout
+        if isinstance(self._stream, io.TextIOWrapper):  # files as pipes, whatever the locale
+            self._stream.reconfigure(encoding="utf-8")
         self.format = format or ("text" if self._stream.isatty() else "json")
         """"text", "yaml", "json" or "csv"."""
         self._columns: list[str] | None = None  # of CSV

@@ -114,6 +114,26 @@ def test_a_second_signal_ends_the_process_at_once(first: int, second: int) -> No
 
 
 @pytest.mark.processes
+def test_two_signals_at_the_same_time_end_the_process_at_once() -> None:
+    program = """
+        async def hangs(node: r2p.Node) -> None:
+            both = {signal.SIGINT, signal.SIGTERM}
+            signal.pthread_sigmask(signal.SIG_BLOCK, both)
+            for each in both:
+                os.kill(os.getpid(), each)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, both)
+            await asyncio.Event().wait()
+
+        import os, signal
+        sys.modules["r2p.modules.runner"].GRACE = 3600.0
+        r2p.run(hangs)
+    """
+    ended = execute(program)
+    assert ended.code in (-signal.SIGINT, -signal.SIGTERM)
+    assert not ended.err
+
+
+@pytest.mark.processes
 @pytest.mark.parametrize(
     "hang", ["await asyncio.Event().wait()", "time.sleep(3600)", "await asyncio.to_thread(time.sleep, 3600)"]
 )

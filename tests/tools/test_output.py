@@ -213,6 +213,13 @@ async def test_files_are_written_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.anyio
+async def test_files_are_utf_8_whatever_the_locale(tmp_path: Path) -> None:
+    with (tmp_path / "out").open("w", encoding="ascii") as file:
+        await Output("yaml", file).put({"text": "grüß dich"})
+    assert "grüß dich" in (tmp_path / "out").read_text(encoding="utf-8")
+
+
+@pytest.mark.anyio
 async def test_a_slow_reader_makes_only_the_writer_wait(pipe: tuple[int, io.TextIOWrapper]) -> None:
     reading, stream = pipe
     record = {"text": "x" * 500_000}  # more than a pipe holds

@@ -18,6 +18,7 @@ CROWDED = 0.8
 """Share of the free slots above which events wait long (thesis 4.4)."""
 
 _PERIOD = 1.0  # s
+_FULL = 1.01  # a full bus, with the rest of a frame that began before its second
 
 Kinds = Annotated[
     list[FrameKind] | None, typer.Option("--kind", help="Only frames of this kind (repeatable).", show_default=False)
@@ -107,7 +108,7 @@ def load_text(report: BusLoad) -> str:
 
 def trouble(report: BusLoad) -> str | None:
     """Return a warning for the user, if the bus carries too much."""
-    if report.total > 1.0:
+    if report.total > _FULL:
         return (
             f"{report.total:.0%} is more than the bus can carry: either the bit rate is wrong (?bitrate=), or this "
             "program read the frames late and the driver does not stamp them"

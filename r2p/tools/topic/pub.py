@@ -5,6 +5,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import sys
 from collections.abc import AsyncIterator, Mapping
 from typing import Annotated, Any, TextIO
@@ -38,6 +39,9 @@ DEFAULT_RATE = 1.0
 
 _CHUNK = 65536  # bytes
 _LINE_MAX = 2 * SIZE_MAX  # bytes: the longest message in base64, with room for its other fields
+
+_YAML_BLOCK = re.compile(r"[A-Za-z_]\w*:(\s|$)")  # its first line
+_YAML_END = "---"
 
 _EXCERPT = 120  # characters of a message that are shown
 _NAMED = 0.5  # seconds in which subscribers announce the names of their nodes
@@ -141,7 +145,7 @@ class _Publication(msgspec.Struct):
             await done.wait()
 
     async def publish_lines(self, rate: float | None) -> None:
-        """Publish one message for each line of stdin."""
+        """Publish the messages on stdin."""
         publisher = self._advertise()
         await self._wait_subscriber(publisher)
         await self._publish_lines(publisher, rate)
@@ -151,13 +155,9 @@ class _Publication(msgspec.Struct):
         self, publisher: r2p.Publisher[Any] | r2p.SporadicPublisher[Any], rate: float | None
     ) -> None:
         ticks = None if rate is None else self.session.node.every(1 / rate)
-        number = 0
-        async for line in read_lines():
-            number += 1
-            if not line.strip():
-                continue
+        async for number, text in split_messages(read_lines()):
             try:
-                message = parse_line(self.message_class, line)
+                message = parse_line(self.message_class, text)
             except r2p.MessageError as error:
                 raise r2p.MessageError(f"line {number}: {error}") from error
             await publisher.publish(message)
@@ -250,6 +250,29 @@ async def read_lines(stream: TextIO | None = None) -> AsyncIterator[str]:
             break
     if size:
         yield _decode(b"".join(rest))
+
+
+async def split_messages(lines: AsyncIterator[str]) -> AsyncIterator[tuple[int, str]]:
+    """Split what is on stdin into messages, each with the number of its first line: one line of JSON, or of `x=1.5`
+    pairs, or the lines of YAML up to `---`.
+    """
+    yaml: list[str] = []
+    number = size = 0
+    async for line in lines:
+        number += 1
+        if line.rstrip() == _YAML_END:
+            if yaml:
+                yield number - len(yaml), "\n".join(yaml)
+            yaml, size = [], 0
+        elif yaml or _YAML_BLOCK.match(line):
+            yaml.append(line)
+            size += len(line)
+            if size > _LINE_MAX:
+                raise r2p.MessageError(f"line {number}: a message on stdin is longer than 128 MiB")
+        elif line.strip():
+            yield number, line
+    if yaml:
+        yield number + 1 - len(yaml), "\n".join(yaml)
 
 
 def _decode(line: bytes) -> str:

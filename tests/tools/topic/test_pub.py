@@ -226,6 +226,25 @@ async def test_stdin(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.virtual_time
+async def test_stdin_as_echo_prints_yaml(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = Listener()
+    yaml = "led: 1\nvalue: 1\n_:\n  topic: leds\n---\nled: 2\n\n---\n---\nled=3\nled: 4\nvalue: 1\n"
+    monkeypatch.setattr("sys.stdin", io.StringIO(yaml))
+    async with robot(listener.listen):
+        async with tool() as session:
+            await pub(session, "cmd", ["-"], type="Led")
+        assert await listener.got(4) == [Led(led=1, value=1), Led(led=2), Led(led=3), Led(led=4, value=1)]
+
+
+@pytest.mark.virtual_time
+async def test_bad_yaml_on_stdin_is_told_by_its_first_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO("led: 1\n---\nled: 1\nvalu: 1\n---\n"))
+    async with robot(Listener().listen), tool() as session:
+        with pytest.raises(r2p.MessageError, match="line 3: Led has no field valu"):
+            await pub(session, "cmd", ["-"], type="Led")
+
+
+@pytest.mark.virtual_time
 async def test_stdin_paced_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     listener = Listener()
     monkeypatch.setattr("sys.stdin", io.StringIO('{"led": 1}\n' * 9))
