@@ -13,7 +13,7 @@ import msgspec
 
 from r2p.codecs.services import HEADER_SIZE, REQUESTS, RESPONSES
 from r2p.errors import MessageError
-from r2p.messages import Layout, Message, Nested, layout, show, u8, u16, u32
+from r2p.messages import Layout, Message, Nested, layout, message_type, show, u8, u16, u32
 from r2p.messages.definition import TYPE_NAME, MessageMeta
 
 Q = TypeVar("Q", bound=Message)
@@ -114,12 +114,22 @@ def define(name: str, request: Any, response: Any = None) -> Definition[Any, Any
 
 
 def body_of(cls: type[Message], field: str) -> type[Message] | None:
-    """Return the type of the field of a topic's messages that holds request or response, if it has one."""
+    """Return the type of the field of a topic's messages that holds request or response; None if it is not a service's.
+
+    A class that was made from a schema lacks a field whose type has no fields: then this is a new class without any.
+    """
     for each in layout(cls).fields:
         if each.name == field and isinstance(each.shape, Nested):
             found: type[Message] = each.shape.layout.cls
             return found
-    return None
+    return message_type(field.title(), "") if is_header(cls) else None
+
+
+def is_header(cls: type[Message]) -> bool:
+    """Return whether a topic's messages have the header alone, as those of all services without fields in the body."""
+    found = layout(cls)
+    leaves = [each for each in found.fields if not isinstance(each.shape, Nested) or each.shape.size]
+    return [each.name for each in leaves] == [name for name, _ in _HEADER] and found.size == HEADER_SIZE
 
 
 def _nested(name: str, service: Any, part: str) -> type[Message]:

@@ -4,6 +4,8 @@ A service is a pair of topics. Its server subscribes to the requests and publish
 way around calls it.
 """
 
+import asyncio
+import contextlib
 import difflib
 from typing import Annotated, Any
 
@@ -14,14 +16,14 @@ import r2p
 from r2p.codecs.services import REQUESTS, RESPONSES, is_of_service
 from r2p.messages.values import parse, to_plain
 from r2p.names import topic_name
-from r2p.services.definition import Definition, body_of, define
+from r2p.services.definition import Definition, body_of, define, is_header
 from r2p.tools import session
 from r2p.tools.completion import complete_module, complete_service, complete_type
 from r2p.tools.options import Format, Wait, time_option
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, TimedOut, UsageError
 from r2p.tools.topic.list import endpoints_of
-from r2p.tools.types import LEARNT, Types, is_service, load_service, load_type
+from r2p.tools.types import LEARNT, Types, is_service, load_service, load_type, type_name
 
 app = session.group("List, inspect and call services.")
 
@@ -29,6 +31,8 @@ _COLUMNS = ["service", "type", "servers", "callers"]
 _REQUEST, _RESPONSE = "request", "response"
 """The fields of the two topics' messages that hold request and response."""
 _TIMEOUT = 5.0  # seconds
+_ANSWERS = 1.0  # seconds to wait for the types of a list
+_AT_ONCE = 16  # services whose types are queried
 
 Name = Annotated[str, typer.Argument(metavar="SERVICE", autocompletion=complete_service, show_default=False)]
 ServiceTypeName = Annotated[
@@ -49,6 +53,13 @@ class _Pair(msgspec.Struct):
     name: str
     requests: r2p.TopicView
     responses: r2p.TopicView
+    types: dict[str, type[r2p.Message]] = msgspec.field(default_factory=dict)
+    """The types of its topics by `_REQUEST` and `_RESPONSE`, as far as they are known."""
+
+    @property
+    def topics(self) -> tuple[tuple[str, r2p.TopicView], ...]:
+        """Both topics, each with the field that holds request or response."""
+        return (_REQUEST, self.requests), (_RESPONSE, self.responses)
 
 
 @session.command(app, "list")
@@ -154,8 +165,34 @@ async def _discover(session: Session, wait: float | None) -> tuple[dict[str, _Pa
     """Return the services by name, and their types as far as they are known or can be learnt."""
     await session.settle(wait, of="services")
     pairs, types = _pairs(session), Types(session.settings)
-    await types.learn_all(session, (view for pair in pairs.values() for view in (pair.requests, pair.responses)))
+    limit = asyncio.Semaphore(_AT_ONCE)
+
+    async def learn(pair: _Pair) -> None:
+        async with limit:
+            await _learn(session, types, pair)
+
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(_ANSWERS), asyncio.TaskGroup() as tasks:
+            for pair in pairs.values():
+                tasks.create_task(learn(pair))
     return pairs, types
+
+
+async def _learn(session: Session, types: Types, pair: _Pair) -> None:
+    """Find the types of a service that is not stated; query the network for unknown ones.
+
+    The query names the topic: services without fields in requests or responses have these in one layout.
+    """
+    if types.stated_service(pair.name, None) is not None:
+        return
+    for field, view in pair.topics:
+        known = types.of(view)
+        if known is not None:
+            pair.types[field] = known
+        if view.fingerprint is not None and types.stated(view.name, None) is None:
+            if known is None or is_header(known):
+                found = await session.module.network.message_type(view.fingerprint, view.name)
+                pair.types |= {} if found is None else {field: found}
 
 
 def _pairs(session: Session) -> dict[str, _Pair]:
@@ -195,7 +232,7 @@ def _body(types: Types, pair: _Pair, field: str) -> type[r2p.Message] | None:
     if stated is not None:
         cls: type[r2p.Message] = (stated.request if field == _REQUEST else stated.response).cls
         return cls
-    topic_type = types.of(pair.requests if field == _REQUEST else pair.responses)
+    topic_type = pair.types.get(field)
     return None if topic_type is None else body_of(topic_type, field)
 
 
@@ -203,13 +240,12 @@ def _type_name(types: Types, pair: _Pair) -> str | None:
     """Return the name of a service's type, or the names of request and response if these are not of one class."""
     stated = types.stated_service(pair.name, None)
     if stated is not None:
-        layouts = stated.requests, stated.responses
+        both = stated.requests.cls, stated.responses.cls
+    elif len(pair.types) == len(pair.topics):
+        both = pair.types[_REQUEST], pair.types[_RESPONSE]
     else:
-        requests, responses = types.of(pair.requests), types.of(pair.responses)
-        if requests is None or responses is None:
-            return None
-        layouts = r2p.layout(requests), r2p.layout(responses)
-    request, response = layouts[0].name.removesuffix(REQUESTS), layouts[1].name.removesuffix(RESPONSES)
+        return None
+    request, response = type_name(both[0]).removesuffix(REQUESTS), type_name(both[1]).removesuffix(RESPONSES)
     one = request.removesuffix("_Request")
     return one if one != request and f"{one}_Response" == response else f"{request}, {response}"
 
@@ -237,9 +273,10 @@ async def _definition(session: Session, name: str, given: str | None) -> Definit
         close = difflib.get_close_matches(name, _pairs(session), n=1)
         question = f"; did you mean {close[0]}?" if close else ""
         raise TimedOut(f"there is no service {name} on {session.network_name}{question}")
+    await _learn(session, types, pair)
     bodies: list[type[r2p.Message] | None] = []
-    for view, field in ((pair.requests, _REQUEST), (pair.responses, _RESPONSE)):
-        learnt = await types.learn(session, view)
+    for field, _ in pair.topics:
+        learnt = pair.types.get(field)
         body = None if learnt is None else body_of(learnt, field)
         if learnt is not None and body is not None and body.__module__ == LEARNT:  # for errors: as its server has it
             body.__name__ = r2p.layout(learnt).name.rpartition("/")[2][: -len(REQUESTS)].replace("_Re", ".Re")
