@@ -186,13 +186,12 @@ async def _learn(session: Session, types: Types, pair: _Pair) -> None:
     if types.stated_service(pair.name, None) is not None:
         return
     for field, view in pair.topics:
-        known = types.of(view)
-        if known is not None:
-            pair.types[field] = known
-        if view.fingerprint is not None and types.stated(view.name, None) is None:
-            if known is None or is_header(known):
-                found = await session.module.network.message_type(view.fingerprint, view.name)
-                pair.types |= {} if found is None else {field: found}
+        found = types.of(view)
+        stated = types.stated(view.name, None) is not None
+        if not stated and view.fingerprint is not None and (found is None or is_header(found)):
+            found = await session.module.network.message_type(view.fingerprint, view.name) or found
+        if found is not None:
+            pair.types[field] = found
 
 
 def _pairs(session: Session) -> dict[str, _Pair]:
