@@ -108,19 +108,19 @@ class DuplicateFilter:
     """The last messages of all publishers of a topic, by number and stamp."""
 
     def __init__(self) -> None:
-        self._stamps: dict[tuple[str, str], list[int]] = {}
+        self._last: dict[tuple[str, str], list[tuple[int, int]]] = {}
 
     def accept(self, sample: Sample) -> bool:
         """Enter a message with a number; return False if it was here before."""
         source = sample.source
         key = (source.module, source.node)
-        stamps = self._stamps.get(key)
-        if stamps is None:
-            if len(self._stamps) >= _PUBLISHERS_MAX:
-                self._stamps.clear()
-            stamps = self._stamps[key] = [0] * _KEPT_MAX
-        place = sample.sequence % _KEPT_MAX
-        if stamps[place] == sample.stamp:
+        last = self._last.get(key)
+        if last is None:
+            if len(self._last) >= _PUBLISHERS_MAX:
+                self._last.clear()
+            last = self._last[key] = [(0, 0)] * _KEPT_MAX
+        place, message = sample.sequence % _KEPT_MAX, (sample.sequence, sample.stamp)
+        if last[place] == message:
             return False
-        stamps[place] = sample.stamp
+        last[place] = message
         return True

@@ -5,6 +5,7 @@ answer wakes its caller directly, a call costs no task, and a call from a handle
 for the task that it runs in.
 """
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -47,6 +48,8 @@ class Outlet(SporadicPublisher[Any]):
         super().__init__(space, node, topic, layout, Sporadic(1.0, pending=PENDING_MAX), latch=False)
         self.changed: Callable[[], None] = lambda: None
         """Callback when the topic gets a subscriber."""
+        self._early: deque[tuple[str, Sample]] = deque(maxlen=PENDING_MAX)
+        """Answers to callers whose links are yet to see their subscription, and the links."""
         topic.publishers.append(self)
         for queue in topic.queues:
             queue.publisher_joined()
@@ -73,12 +76,23 @@ class Outlet(SporadicPublisher[Any]):
         sample = DirectedSample(
             data, self._source, stamp, stamp + lifetime, sequence, PublisherClass.SPORADIC, to=caller
         )
+        if link and not self._topic.remote_subscribers:
+            self._early.append((link, sample))
+        else:
+            self._deliver_by(link, sample, lifetime)
+
+    def _deliver_by(self, link: str, sample: Sample, lifetime: int) -> None:
         blocked = self._topic.deliver_by(link, sample)
         if blocked is not None:
             self._deliver_later(sample, blocked, lifetime)
 
     def subscriber_joined(self, sink: Sink) -> None:
         super().subscriber_joined(sink)
+        now = self._now()
+        while self._early:
+            link, sample = self._early.popleft()
+            if sample.deadline > now:
+                self._deliver_by(link, sample, sample.deadline - now)
         self.changed()
 
     def link_degraded(self, link: str, reason: str) -> None:

@@ -137,6 +137,7 @@ class LineLink(BufferedLink):
         self._samples: deque[bytes] = deque()
         self._buffered_bytes = 0  # bytes in these three queues
         self._corked = False  # whether lines wait for the end of this turn of the loop
+        self._answering = False  # whether an answer to a subscriber is among them
         self._blocked = False  # whether the carrier is full
         self._limit = self._buffer = buffer  # bytes that may wait; -1 while samples have to wait for the grace period
         self._grace: asyncio.TimerHandle | None = None
@@ -282,6 +283,8 @@ class LineLink(BufferedLink):
         if not real_time:
             self._send_at_once(line)
             return
+        if self._answering:  # a latched value must not overtake the answer to its subscriber
+            self._flush()
         self._unsent = topic, sample  # before it is sent: it is lost if the carrier breaks by it
         self._send_at_once(line)
         if not self.up:
@@ -307,6 +310,8 @@ class LineLink(BufferedLink):
             return
         self._buffered_bytes += len(line)
         (self._urgent if urgent else self._management).append(line)
+        if topic == _MANAGEMENT and management.type_of(data) == management.ManagementType.SUBSCRIBE_RESPONSE:
+            self._answering = True
 
     def manage(self, data: bytes, source: Hashable) -> None:
         if self._gate is None or self._gate.is_open:
@@ -403,7 +408,7 @@ class LineLink(BufferedLink):
         self._send(line)
 
     def _uncork(self) -> None:
-        self._corked = False
+        self._corked = self._answering = False
         try:
             self._flush()
         except Exception as error:  # noqa: BLE001 - counted and logged

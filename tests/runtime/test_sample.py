@@ -20,6 +20,12 @@ def test_what_was_seen_before() -> None:
     assert not seen.accept(sample(499, 49900))
 
 
+def test_many_messages_of_one_instant_are_all_new() -> None:
+    seen = DuplicateFilter()
+    assert all(seen.accept(sample(number, 100)) for number in range(1, 200))
+    assert not seen.accept(sample(199, 100))
+
+
 def test_a_publisher_whose_clock_went_back_passes_a_gateway() -> None:
     seen = DuplicateFilter()
     assert all(seen.accept(sample(number, 1_000_000 + number)) for number in range(1, 100))

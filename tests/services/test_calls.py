@@ -11,7 +11,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import r2p
+from r2p.msg import Led
 from r2p.services.server import WAITING_MAX
+from r2p.services.topics import Outlet
+from r2p.units import MILLISECOND, SECOND
+from tests.runtime.test_topic import Line
 from tests.services.common import Add, Desk, add, nodes, outcome, until
 
 if TYPE_CHECKING:
@@ -337,3 +341,17 @@ async def test_remapping_renames_a_service() -> None:
         module.start(serving)
         await module.wait()
         assert not module.space.topics.keys() & {"add_q", "add_r"}
+
+
+@with_pair
+async def test_an_answer_waits_until_its_link_knows_of_its_caller(server: r2p.Node, client: r2p.Node) -> None:
+    outlet = Outlet(server._space, server, "answers", r2p.layout(Led))
+    outlet.answer(b"stale", MILLISECOND, "a", 1)
+    await asyncio.sleep(0.1)
+    outlet.answer(b"fresh", SECOND, "a", 1)
+    one, other = Line("b"), Line("a")
+    outlet.where.join(other)
+    outlet.where.join(one)
+    assert (one.got, other.got) == ([], [b"fresh"])
+    outlet.answer(b"later", SECOND, "b", 2)
+    assert one.got == [b"later"]

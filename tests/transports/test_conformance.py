@@ -213,8 +213,17 @@ async def test_nothing_is_sent_without_a_subscriber(cable: Cable) -> None:
 
 @conforms
 async def test_a_latched_value_comes_late_and_after_a_reconnect(cable: Cable) -> None:
+    await latches(cable, r2p.NonRealTime())
+
+
+@conforms
+async def test_so_does_a_latched_event(cable: Cable) -> None:
+    await latches(cable, r2p.Sporadic(deadline=10.0))
+
+
+async def latches(cable: Cable, publisher_class: r2p.NonRealTime | r2p.Sporadic) -> None:
     async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
-        publisher = alice.advertise("leds", Led, latch=True)
+        publisher = alice.advertise("leds", Led, publisher_class, latch=True)
         await publisher.publish(Led(led=7))
         subscriber = bob.subscribe("leds", Led)
         assert await subscriber.fetch() == Led(led=7)
