@@ -107,8 +107,8 @@ class HeldMessages:
         self._held: deque[tuple[Sample, Callable[[], list[Sink] | None]]] = deque()
         self._places = 0
 
-    def __bool__(self) -> bool:
-        return bool(self._held)
+    def __len__(self) -> int:
+        return len(self._held)
 
     def hold(self, sample: Sample, go_on: Callable[[], list[Sink] | None]) -> bool:
         """Hold a message; return False if there are too many. `go_on` returns the sinks without room."""
@@ -120,7 +120,8 @@ class HeldMessages:
 
     def release(self, failed: Callable[[Exception], object], *, but: Sequence[Sample] = ()) -> None:
         """Go on with all messages but these; `failed` is called with exceptions."""
-        for sample, go_on in self._take():
+        held, self._held, self._places = self._held, deque(), 0
+        for sample, go_on in held:
             if any(sample is each for each in but):
                 continue
             try:
@@ -129,13 +130,6 @@ class HeldMessages:
             except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
                 failed(error)
 
-    def drop(self) -> list[Sample]:
-        """Give up all messages; return them."""
-        return [sample for sample, _ in self._take()]
-
-    def _take(self) -> deque[tuple[Sample, Callable[[], list[Sink] | None]]]:
-        held, self._held, self._places = self._held, deque(), 0
-        return held
 
 
 class Route:
@@ -147,9 +141,10 @@ class Route:
     that messages reach it. Until then, but at most until `ready_by` (monotonic ns), messages are `held`.
     """
 
-    __slots__ = ("dropped", "forwarded", "held", "port", "ready_by", "shaper", "subscriber", "target")
+    __slots__ = ("dropped", "forwarded", "held", "port", "ready_by", "shaper", "source", "subscriber", "target")
 
-    def __init__(self, port: BridgePort, target: "BridgedTopic", shaper: Shaper | None) -> None:
+    def __init__(self, source: BridgePort, port: BridgePort, target: "BridgedTopic", shaper: Shaper | None) -> None:
+        self.source = source
         self.port = port
         self.target = target
         self.shaper = shaper
@@ -226,8 +221,8 @@ class BridgedTopic(Topic):
             if routes is None:
                 routes = [] if self.relayed is None else self.relayed.active_from(link, now)
                 self.active_routes[link] = routes
-            if not routes and not self.queues:
-                self._drop_unsubscribed(sample)
+            if not routes and not self.queues:  # not yet, or no longer, which its publisher will soon know: no loss
+                port.dropped[_NOT_SUBSCRIBED] += 1
                 return None
         blocked = super().deliver(sample) if self.queues else None
         for route in routes:
@@ -264,7 +259,7 @@ class BridgedTopic(Topic):
             return _offer(route, subscriber, sample, blocked)
         if sample.hops >= HOPS_MAX:
             route.dropped["too many hops"] += 1
-        elif sample.deadline and sample.drop_late and port.now() > sample.due and not self._is_latched(sample):
+        elif sample.deadline and sample.drop_late and port.now() > sample.due and not self.is_latched(sample):
             route.dropped["late"] += 1
         elif shaper is None:
             return _offer(route, subscriber, sample, blocked)
@@ -276,25 +271,15 @@ class BridgedTopic(Topic):
 
     def _await_subscriber(self, route: Route, sample: Sample, now: int) -> None:
         """Hold a message for a link that will soon serve its new subscriber; drop it if there is none."""
-        if route.held is None and now < route.ready_by:
+        if route.held is None and now < route.ready_by and self.relayed is not None:
             route.held = HeldMessages()
-            asyncio.get_running_loop().call_later((route.ready_by - now) / SECOND, self._give_up, route, route.held)
+            self.relayed.holding[route] = None
+            seconds = (route.ready_by - now) / SECOND
+            asyncio.get_running_loop().call_later(seconds, self.relayed.give_up, route, route.held)
         if route.held is None or not route.held.hold(sample, functools.partial(self._forward_held, route, sample)):
-            self._drop_unsubscribed(sample)
+            route.source.dropped[_NOT_SUBSCRIBED] += 1
 
-    def _give_up(self, route: Route, held: HeldMessages) -> None:
-        if route.held is held:
-            route.held = None
-            for sample in held.drop():
-                self._drop_unsubscribed(sample)
-
-    def _drop_unsubscribed(self, sample: Sample) -> None:
-        """Count a message that no other link wants yet, or no longer, which its publisher will soon know: no loss."""
-        if (port := self._ports.get(sample.source.link)) is not None:
-            port.dropped[_NOT_SUBSCRIBED] += 1
-
-    def _is_latched(self, sample: Sample) -> bool:
-        """Return whether a message may be a latched value, which is worth sending however old it is."""
+    def is_latched(self, sample: Sample) -> bool:
         source = self._ports.get(sample.source.link)
         return source is not None and source.link.latched(self.name)
 
@@ -338,7 +323,7 @@ class BridgedTopic(Topic):
             self.by_link[sink.link] = sink
             if self.relayed is not None:
                 self.relayed.subscriber_changed(self, sink)
-                self.relayed.release_held(sink)
+                self.relayed.release_held(self, sink)
         super().join(sink)  # which ends with `resend_latched`
 
     def leave(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
@@ -368,10 +353,14 @@ class RelayedTopic:
     """A topic of the robot, on all links. `topics` has it by its names, which differ where there is a prefix.
 
     Its routes lead from links on which it has been published to those on which it has been subscribed; they stay for
-    their counters. `published_on` and `subscribed_on` are the ports where that is so now.
+    their counters. `published_on` and `subscribed_on` are the ports where that is so now. While a route is `holding`
+    messages, its source counts as one where the topic is published, even if the publisher has gone meanwhile. `review`
+    looks at that anew.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, review: Callable[[], object]) -> None:
+        self._review = review
+        self.holding: dict[Route, None] = {}
         self.topics: dict[str, BridgedTopic] = {}
         self.published_on: list[BridgePort] = []
         self.published_on_kinds: PortsByKind = []
@@ -448,13 +437,27 @@ class RelayedTopic:
                 route.ready_by = LONG_AGO
         self.changed()
 
-    def release_held(self, subscriber: RemoteSubscriber) -> None:
-        """Forward what waited for a link that has joined a topic, but for values that it will get as latched ones."""
-        latched = [sample for topic in self.topics.values() for sample in topic.latched_values()]
-        for route in list(self._into.get(subscriber.link_name, {}).values()):
-            if route.subscriber is subscriber and route.held is not None:
+    def release_held(self, topic: BridgedTopic, subscriber: RemoteSubscriber) -> None:
+        """Forward what waited for a link that has joined the topic, but for values that it will get as latched ones."""
+        latched = [sample for each in self.topics.values() for sample in each.latched_values()]
+        for route in list(self.holding):
+            if route.target is topic and route.port.link is subscriber.link and route.held is not None:
+                route.subscriber = subscriber  # also where the source is gone, and the route with it
                 held, route.held = route.held, None
                 held.release(route.port.link.stats.lost.internal_error, but=latched)
+                self._held_no_more(route)
+
+    def give_up(self, route: Route, held: HeldMessages) -> None:
+        """Drop what waited in vain."""
+        if route.held is held:
+            route.held = None
+            there = route.source.link.up  # else its counters are gone with it
+            (route.source if there else route.port).dropped[_NOT_SUBSCRIBED] += len(held)
+            self._held_no_more(route)
+
+    def _held_no_more(self, route: Route) -> None:
+        del self.holding[route]
+        asyncio.get_running_loop().call_soon(self._review)  # its publisher may have gone meanwhile
 
 
 def _offer(route: Route, subscriber: RemoteSubscriber, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:

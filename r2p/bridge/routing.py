@@ -114,6 +114,8 @@ class RoutingTable:
         ports = [port for port in self._ports.values() if port.in_tree and self._carries(topic, port)]
         names = {port: self._policy.to_link_name(topic, port.name) for port in ports}
         published_on = [port for port in ports if port.demand.is_published(names[port])]
+        if (relayed := self.by_name.get(topic)) is not None:
+            published_on += dict.fromkeys(each.source for each in relayed.holding if each.source not in published_on)
         subscribed_on = [port for port in ports if port.demand.is_subscribed(names[port])]
         if self._is_used(topic, ports, published_on, subscribed_on):
             self._idle.discard(topic)
@@ -155,8 +157,9 @@ class RoutingTable:
     ) -> None:
         relayed = self.by_name.get(topic)
         if relayed is None:
-            relayed = self.by_name[topic] = RelayedTopic()
+            relayed = self.by_name[topic] = RelayedTopic(functools.partial(self._review_all, (topic,)))
         relayed.set_demand(published_on, subscribed_on)
+        published_on = [port for port in published_on if port in ports]
         for port in ports:
             self._enter(relayed, topic, port)
         if topic.startswith(LOADER_PREFIX):
@@ -181,7 +184,7 @@ class RoutingTable:
             route = relayed.route(source.name, target.name)
             if route is None:
                 shaper = self._shaper(topic, source, target)
-                route = Route(target, self._topic(topic, target), shaper)
+                route = Route(source, target, self._topic(topic, target), shaper)
                 relayed.add(source.name, route)
             if route.subscriber is None:
                 route.ready_by = ready_by
@@ -298,6 +301,8 @@ class RoutingTable:
         here = self._type_on(topic, [port], ROLE_PUBLISHES)
         published = self._type_elsewhere(topic, port, relayed.published_on, ROLE_PUBLISHES)
         asked = self._type_elsewhere(topic, port, relayed.subscribed_on, ROLE_SUBSCRIBES)
+        if not (published or asked) and relayed.holding and topic in port.announced_types:
+            return port.announced_types[topic]  # the publisher has gone, and its messages have yet to be sent
         return published or asked or TopicType(), here or asked or published or TopicType()
 
     def _type_elsewhere(self, topic: str, port: BridgePort, ports: list[BridgePort], role: int) -> TopicType | None:

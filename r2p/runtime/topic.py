@@ -255,6 +255,10 @@ class Topic:
         """Return the latched values of remote publishers."""
         return [value for source in self.latched_sources if (value := source.latched_value(self)) is not None]
 
+    def is_latched(self, sample: Sample) -> bool:
+        """Return whether a sample of another link may be a latched value, which is worth sending however old it is."""
+        return False
+
     def resend_latched(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
         """Let publishers resend latched values to a subscriber that joins behind a link, or is back after a reboot."""
         for publisher in list(self.publishers):  # one may be closed by what its message brings about

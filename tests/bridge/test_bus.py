@@ -13,7 +13,7 @@ import pytest
 
 import r2p
 from r2p.codecs.can_bits import Frame
-from r2p.msg import Led
+from r2p.msg import Led, Text
 from r2p.sim import SimCan
 from r2p.sim.can import CanNode
 from r2p.testing.network import node_in
@@ -34,12 +34,13 @@ class Lab:
 
     def __init__(self) -> None:
         self.can = SimCan(seed=1)
+        self.near = MemoryNetwork()
         self.gateways: list[r2p.Module] = []
 
     @asynccontextmanager
     async def modules(self, *, further: bool) -> AsyncIterator[tuple[r2p.Module, r2p.Module]]:
         """Open the modules and their gateways, and wait until these agree."""
-        near, far = MemoryNetwork(), MemoryNetwork()
+        near, far = self.near, MemoryNetwork()
         gateways = [[near.transport(), self.can.transport()], [far.transport(), self.can.transport()]]
         async with AsyncExitStack() as stack:
             for number, via in enumerate(gateways if further else gateways[:1]):
@@ -81,6 +82,28 @@ async def test_what_follows_wait_subscriber_arrives(
         assert not lab.lost()
 
 
+@pytest.mark.parametrize("kind", [Led, Text], ids=["fixed", "variable"])
+@pytest.mark.parametrize("first", ["publisher", "subscriber"])
+async def test_what_a_program_publishes_before_it_ends_arrives(first: str, kind: type[r2p.Message]) -> None:
+    lab = Lab()
+    async with lab.modules(further=False) as (_, b), node_in(b) as far:
+        if first == "subscriber":
+            subscriber = far.subscribe("topic", kind, queue=10)
+            await asyncio.sleep(_SEEN)
+        async with r2p.Module("C", via=lab.near.transport()) as c, node_in(c) as near:
+            publisher = near.advertise("topic", kind)
+            if first == "publisher":
+                await asyncio.sleep(_SEEN)
+                subscriber = far.subscribe("topic", kind, queue=10)
+            await publisher.wait_subscriber()
+            for _ in range(3):
+                await publisher.publish(kind())
+        await asyncio.sleep(_AGREED)
+        assert len(subscriber.queue) == 3
+        assert not lab.lost()
+        assert not b.links[0].losses
+
+
 async def test_what_waits_for_an_answer_that_does_not_get_through_is_counted() -> None:
     lab = Lab()
     async with lab.modules(further=False) as (a, b), node_in(a) as near, node_in(b) as far:
@@ -114,6 +137,18 @@ async def test_each_arrives_once_also_if_the_last_one_is_latched(latch: bool) ->
             await publisher.publish(Led(led=number))
         await asyncio.sleep(_SEEN)
         assert [Led.decode(each.data).led for each in subscriber.queue] == [0, 1, 2]
+        assert not lab.lost()
+
+
+async def test_a_latched_event_reaches_who_comes_after_its_deadline() -> None:
+    lab = Lab()
+    async with lab.modules(further=False) as (a, b), node_in(a) as near, node_in(b) as far:
+        await near.advertise("leds", Led, r2p.Sporadic(deadline=0.1), latch=True).publish(Led(led=7))
+        for _ in range(2):
+            await asyncio.sleep(_AGREED)
+            subscriber = far.subscribe("leds", Led)
+            assert (await subscriber.fetch(timeout=1.0)).led == 7
+            subscriber.close()
         assert not lab.lost()
 
 

@@ -308,7 +308,8 @@ class Transmitter:
             deadline = NEVER
             self._frames += frames
         else:
-            deadline = now + self._time_left(topic, sample, publisher)
+            latched = subscriber is not None and subscriber.topic.is_latched(sample)
+            deadline = now + self._time_left(topic, sample, latched=latched if publisher is None else publisher.latch)
             self._messages += 1
         self._stats.sent += 1
         self._stats.bytes_sent += len(sample.data)
@@ -382,11 +383,11 @@ class Transmitter:
         if publisher is not None and done.fate is not Fate.REPLACED:
             publisher.link_missed(self._name, done.fate.value, late)
 
-    def _time_left(self, topic: str, sample: Sample, publisher: PublisherHandle | None) -> int:
+    def _time_left(self, topic: str, sample: Sample, *, latched: bool) -> int:
         """Return the ns until the deadline. A latched value that is sent again gets a new one."""
         # A sample from another computer has `expires`, its deadline by the clock here.
         left = sample.due - self._driver.clock.now() if sample.deadline else 0
-        if left > 0 or (sample.deadline and not (publisher is not None and publisher.latch)):
+        if left > 0 or (sample.deadline and not latched):
             return left
         slotted = self._slotted.by_topic.get(topic)
         return round(slotted.publisher.period * SECOND) if slotted is not None else _DEFAULT_DEADLINE
