@@ -131,7 +131,6 @@ class HeldMessages:
                 failed(error)
 
 
-
 class Route:
     """One topic from one link to another: `subscriber` is set while it is subscribed there.
 

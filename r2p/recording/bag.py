@@ -5,7 +5,7 @@ import functools
 import logging
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator
 from operator import itemgetter
 from types import TracebackType
 from typing import Any, Final, Generic, Self, TypeVar, overload
@@ -107,7 +107,8 @@ class Bag:
         self.undecodable: Counter[str] = Counter()
         """Messages that could not be read, by topic or channel."""
         self.damaged = sum(each.summary.damaged for each in self.files)
-        """Chunks that could not be read."""
+        """Chunks that could not be read, among those that were looked at so far; `check` looks at all."""
+        self._unreadable: set[tuple[int, int]] = set()  # those among them that were found later: file and offset
         for problem in self.problems:
             logger.warning("%s", problem)
 
@@ -322,6 +323,13 @@ class Bag:
         for number, (log_time, channel_id, sequence, publish_time, data) in self._messages(wanted, start, end):
             yield RawMessage(self.files[number].channels[channel_id], log_time, publish_time, sequence, data)
 
+    def check(self) -> Generator[None]:
+        """Read every chunk, so that `damaged` counts all that can't be read. Yields after each."""
+        for number, file in enumerate(self.files):
+            for chunk in file.summary.chunks:
+                self._read(number, chunk, frozenset(), 0, 0)
+                yield
+
     def last_before(self, time: int, topics: Collection[str] | None = None) -> list[RecordedSample]:
         """Return the last sample of each channel before `time` (UTC, ns), if it has one: what a late subscriber gets.
 
@@ -376,13 +384,15 @@ class Bag:
     def _read(
         self, number: int, chunk: ChunkRef, ids: frozenset[int] | None, start: int, end: int
     ) -> list[MessageRecord]:
-        """Return the messages of a chunk. A damaged chunk is counted, and has an empty list."""
+        """Return the messages of a chunk. A damaged chunk is counted once, and has an empty list."""
         try:
             return self.files[number].messages(chunk, ids, start, end)
         except BagError as error:
-            self.damaged += 1
-            if self.damaged == 1:
-                logger.warning("%s; r2p bag recover saves what is behind it", error)
+            if (place := (number, chunk.offset)) not in self._unreadable:
+                self._unreadable.add(place)
+                self.damaged += 1
+                if self.damaged == 1:
+                    logger.warning("%s; r2p bag recover saves what is behind it", error)
             return []
 
     def _chunks(

@@ -115,7 +115,10 @@ class RecordingFiles:
         report: Callable[[str], None],
         opened: Callable[[Path], BinaryIO] = open_new,
     ) -> None:
-        """Create the first file, except for snapshots. Raises OSError, and Error if too little of the disk is free."""
+        """Create the first file; for snapshots, only try whether that can be done.
+
+        Raises OSError, and Error if too little of the disk is free.
+        """
         self.path = path
         self.paths: list[Path] = []
         self.stopped = ""
@@ -141,7 +144,9 @@ class RecordingFiles:
         self._file: McapWriter | None = None
         if (free := self._free()) < options.min_free:
             raise Error(f"{path} has only {_size(free)} of disk: {_size(options.min_free)} are to stay free (min_free)")
-        if not options.snapshot:
+        if options.snapshot:
+            self._try_to_create()
+        else:
             self._open()
 
     @property
@@ -309,6 +314,13 @@ class RecordingFiles:
                 first = self._number == 1 and not self._options.snapshot
                 if first or not self._numbered:  # others take the next number that is free
                     raise
+
+    def _try_to_create(self) -> None:
+        """Create the next file, and delete it again. Raises OSError."""
+        number = self._number
+        path, raw = self._create()
+        _discard(raw, path)
+        self._number = number
 
     @property
     def _numbered(self) -> bool:

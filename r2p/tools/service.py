@@ -32,7 +32,7 @@ _REQUEST, _RESPONSE = "request", "response"
 """The fields of the two topics' messages that hold request and response."""
 _TIMEOUT = 5.0  # seconds
 _ANSWERS = 1.0  # seconds to wait for the types of a list
-_AT_ONCE = 16  # services whose types are queried
+_AT_ONCE = 16  # queries for types
 
 Name = Annotated[str, typer.Argument(metavar="SERVICE", autocompletion=complete_service, show_default=False)]
 ServiceTypeName = Annotated[
@@ -167,31 +167,32 @@ async def _discover(session: Session, wait: float | None) -> tuple[dict[str, _Pa
     pairs, types = _pairs(session), Types(session.settings)
     limit = asyncio.Semaphore(_AT_ONCE)
 
-    async def learn(pair: _Pair) -> None:
+    async def learn(pair: _Pair, field: str) -> None:
         async with limit:
-            await _learn(session, types, pair)
+            await _learn(session, types, pair, field)
 
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(_ANSWERS), asyncio.TaskGroup() as tasks:
             for pair in pairs.values():
-                tasks.create_task(learn(pair))
+                for field, _ in pair.topics:
+                    tasks.create_task(learn(pair, field))
     return pairs, types
 
 
-async def _learn(session: Session, types: Types, pair: _Pair) -> None:
-    """Find the types of a service that is not stated; query the network for unknown ones.
+async def _learn(session: Session, types: Types, pair: _Pair, field: str) -> None:
+    """Find the type of a topic of a service that is not stated; query the network for an unknown one.
 
-    The query names the topic: services without fields in requests or responses have these in one layout.
+    The query names the topic: all requests and responses without fields have one layout.
     """
     if types.stated_service(pair.name, None) is not None:
         return
-    for field, view in pair.topics:
-        found = types.of(view)
-        stated = types.stated(view.name, None) is not None
-        if not stated and view.fingerprint is not None and (found is None or is_header(found)):
-            found = await session.module.network.message_type(view.fingerprint, view.name) or found
-        if found is not None:
-            pair.types[field] = found
+    view = dict(pair.topics)[field]
+    found = types.of(view)
+    stated = types.stated(view.name, None) is not None
+    if not stated and view.fingerprint is not None and (found is None or is_header(found)):
+        found = await session.module.network.message_type(view.fingerprint, view.name) or found
+    if found is not None:
+        pair.types[field] = found
 
 
 def _pairs(session: Session) -> dict[str, _Pair]:
@@ -272,9 +273,9 @@ async def _definition(session: Session, name: str, given: str | None) -> Definit
         close = difflib.get_close_matches(name, _pairs(session), n=1)
         question = f"; did you mean {close[0]}?" if close else ""
         raise TimedOut(f"there is no service {name} on {session.network_name}{question}")
-    await _learn(session, types, pair)
     bodies: list[type[r2p.Message] | None] = []
     for field, _ in pair.topics:
+        await _learn(session, types, pair, field)
         learnt = pair.types.get(field)
         body = None if learnt is None else body_of(learnt, field)
         if learnt is not None and body is not None and body.__module__ == LEARNT:  # for errors: as its server has it

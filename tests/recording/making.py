@@ -54,6 +54,16 @@ def write(
     return path
 
 
+def damage(path: Path, number: int = 0) -> Path:
+    """Overwrite 16 bytes in the middle of a chunk."""
+    with Bag(path) as bag:
+        chunk = bag.files[0].summary.chunks[number]
+    with path.open("r+b") as file:
+        file.seek(chunk.offset + chunk.length - 20)
+        file.write(bytes(16))
+    return path
+
+
 def plain(bag: Bag, start: int | None = None, end: int | None = None) -> Plain:
     return [(each.topic, each.sample, each.log_time) for each in bag.records(start=start, end=end)]
 

@@ -13,7 +13,7 @@ from r2p.recording.bag import Bag
 from r2p.recording.editing import ChannelSelection, Edited, cut, merge
 from r2p.recording.writer import BagWriter
 from tests.recording.checker import check
-from tests.recording.making import MS, T0, Samples, led, leds, of, plain, read, write
+from tests.recording.making import MS, T0, Samples, damage, led, leds, of, plain, read, write
 
 
 def at(number: int) -> int:
@@ -40,6 +40,16 @@ def test_whole_chunks_are_copied_and_those_at_the_ends_read(tmp_path: Path) -> N
         assert done.copied_chunks == len(inside) > 5
         assert part.metadata == bag.metadata
         assert list(part.attachments()) == list(bag.attachments())
+
+
+def test_a_damaged_chunk_is_not_copied(tmp_path: Path) -> None:
+    path = damage(write(tmp_path / "drive.mcap", leds(100)), 3)
+    out, done = edited(path)
+    assert done.unreadable == 1
+    with Bag(path) as bag, Bag(out) as part:
+        assert done.copied_chunks == len(part.files[0].summary.chunks) == len(bag.files[0].summary.chunks) - 1
+        assert plain(part) == plain(bag)
+        assert (len(plain(part)), part.damaged) == (sum(part.topics.values()), 0)
 
 
 def test_a_cut_may_keep_latched_messages_before_it(tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ def convert(
     """Convert a recording. The formats are those of the suffixes; `to` names the one of a target without.
 
     The target appears when it is complete. One that exists is replaced only with `overwrite`. `stopped` is asked for
-    each message, and ends the conversion without a result. Raises BagError, and OSError of the files.
+    each message, and ends the conversion without a result. Raises BagError, and OSError of what is written.
     """
     options = options or ConversionOptions()
     read, write = source_format(source), target_format(target, to)
@@ -114,7 +114,7 @@ def convert(
     losses, messages = Losses(), dict[str, int]()
     retype = Retyping(options, write.version, losses)
     with _replacing(target) as path:
-        records = read.load().read(source, options, losses)
+        records = _records(read, source, options, losses)
         with write.load().open_sink(path, options, losses) as sink:
             for each in records:
                 if stopped():
@@ -131,6 +131,14 @@ def convert(
             if not messages:
                 raise BagError(f"there is nothing to write into {target}: {_why(source, options, losses)}")
     return ConversionResult(read.name, write.name, messages, losses)
+
+
+def _records(format: Format, source: Path, options: ConversionOptions, losses: Losses) -> Iterator[ConvertedItem]:
+    """Iterate over what a recording has. Raises BagError, also for an error of the disk."""
+    try:
+        yield from format.load().read(source, options, losses)
+    except OSError as error:
+        raise BagError(f"can't read {error.filename or source}: {error.strerror or error}") from error
 
 
 def _why(source: Path, options: ConversionOptions, losses: Losses) -> str:
@@ -159,7 +167,7 @@ def extent(path: Path) -> tuple[int, int]:
     if found.name == "mcap":
         with Bag(path) as bag:
             return bag.start, bag.end
-    records = found.load().read(path, ConversionOptions(), Losses())
+    records = _records(found, path, ConversionOptions(), Losses())
     times = [each.log_time for each in records if isinstance(each, ConvertedRecord)]
     return min(times, default=0), max(times, default=0)
 

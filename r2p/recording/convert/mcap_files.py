@@ -41,7 +41,7 @@ def read_files(paths: list[Path], options: ConversionOptions, losses: Losses) ->
         for topic, count in bag.undecodable.items():
             losses[f"messages of {topic} that can't be decoded"] += count
         if bag.damaged:
-            losses["chunks of the file that can't be read, with all messages in them"] += bag.damaged
+            losses["chunks of the file that can't be read, with the messages there"] += bag.damaged
 
 
 def _samples(bag: Bag, options: ConversionOptions) -> Iterator[ConvertedRecord]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import r2p
 from r2p.tools.bag.files import File, opened
 from r2p.tools.bag.times import iso
 from r2p.tools.options import Format
@@ -48,7 +49,7 @@ async def attachment(
         try:
             target.write_bytes(found[name].data)
         except OSError as error:
-            raise UsageError(f"-o: can't write {target}: {error.strerror}") from error
+            raise r2p.Error(f"can't write {target}: {error.strerror}") from error
         return
     await _print(found[name])
 

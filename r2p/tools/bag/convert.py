@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import r2p
 from r2p.tools.bag.times import End, Start, span
 from r2p.tools.completion import beginning
 from r2p.tools.options import Format, topic_pairs, topic_pattern
 from r2p.tools.output import Output
-from r2p.tools.session import UsageError, settings
+from r2p.tools.session import settings
 from r2p.tools.types import Types
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ async def convert(
     try:
         result = await _in_thread(run)
     except OSError as error:
-        raise UsageError(f"{error.filename or target}: {error.strerror}") from error
+        raise r2p.Error(f"can't write {target}: {error.strerror or error}") from error
     await output.put(_record(source, target, result), _text(target, result, formats.lost_in_words(result.losses)))
 
 

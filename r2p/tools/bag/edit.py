@@ -126,7 +126,9 @@ async def _report(path: Path, done: "Edited | None", format: Any) -> None:
         }
         when = f"{length(bag.end - bag.start)} from {shown(bag.start)}" if bag.start else "empty"
     if done is not None and done.unreadable:
-        notify(f"{done.unreadable} chunks could not be read, and are missing in {path}")
+        count = done.unreadable
+        what = "1 chunk could not be read, and is" if count == 1 else f"{count} chunks could not be read, and are"
+        notify(f"{what} missing in {path}")
     topics = f"{record['topics']} topic{'' if record['topics'] == 1 else 's'}"
     text = f"{path} has {record['messages']} messages of {topics}, {when}: {size_text(size)}"
     await Output(format).put(record, text)

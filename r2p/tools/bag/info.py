@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from r2p.codecs import PublisherClass
-from r2p.tools.bag.files import File, opened, size_text
+from r2p.tools.bag.files import File, opened, run_steps, size_text
 from r2p.tools.bag.times import iso, length, shown
 from r2p.tools.options import CLASS_NAMES, Format
 from r2p.tools.output import Output
@@ -26,7 +26,9 @@ _LOSS_COLUMNS = ["of", "cause", "count"]
 async def info(
     file: File,
     *,
-    all: Annotated[bool, typer.Option("--all", "-a", help="Count all losses, also in large recordings.")] = False,
+    all: Annotated[
+        bool, typer.Option("--all", "-a", help="Count all losses, and check that every chunk can be read.")
+    ] = False,
     format: Format = None,
 ) -> None:
     """Show what is in a recording, and what was lost.
@@ -35,6 +37,8 @@ async def info(
     """
     output = Output(format)
     with opened(file) as bag:
+        if all:
+            await run_steps(bag.check())
         record = _record(bag, count_all=all)
     topics, channels, losses = record["topics"], record["channels"], record["losses"]
     if output.format == "text":
@@ -102,7 +106,8 @@ def _head(record: dict[str, Any]) -> Iterable[str]:
     if record["attachments"]:
         yield f"attachments  {', '.join(record['attachments'])}"
     if record["damaged_chunks"]:
-        yield f"damaged      {record['damaged_chunks']} chunks, whose messages are not counted"
+        count = record["damaged_chunks"]
+        yield f"damaged      {count} chunk{'s' * (count != 1)}, whose messages can't be read"
     is_watched = any(each["channel"] == LOSSES for each in record["channels"])
     if is_watched and not (record["losses"] or record["uncounted"]):
         yield "lost         nothing, by what the recorder knows"

@@ -252,20 +252,29 @@ def _hints(session: Session, topics: list[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _snapshots(session: Session, recorder: "Recorder") -> Iterator[None]:
-    """Write a snapshot at SIGUSR1, at the key s, and when the service is called."""
+    """Write a snapshot at SIGUSR1, at the key s, and when the service is called.
+
+    Raises Error at the end if one could not be written.
+    """
     if not recorder.keeps:
         with _on_signal(signal.SIGUSR1, lambda: notify("there is no snapshot to write: start with --snapshot 30s")):
             notify(f"recording into {recorder.path}; Ctrl-C ends it")
             yield
         return
     tasks: set[asyncio.Task[Trigger.Response]] = set()
+    failed: list[OSError] = []
 
     async def write(_request: Trigger.Request | None = None) -> Trigger.Response:
         try:
             path = await recorder.snapshot()
-        except (r2p.Error, OSError) as error:
+        except r2p.Error as error:
             notify(f"no snapshot: {error}")
             return Trigger.Response(success=False, message=f"{error}"[:_ANSWER_MAX])
+        except OSError as error:
+            failed.append(error)
+            why = f"can't write {error.filename or recorder.path}: {error.strerror}"
+            notify(f"no snapshot: {why}; the last seconds are still kept: try again when that is solved")
+            return Trigger.Response(success=False, message=why[-_ANSWER_MAX:])  # its end says what is wrong
         notify(f"snapshot: {path}")
         return Trigger.Response(success=True, message=f"{path}"[-_ANSWER_MAX:])
 
@@ -279,7 +288,13 @@ def _snapshots(session: Session, recorder: "Recorder") -> Iterator[None]:
     with _on_signal(signal.SIGUSR1, start), on_key(lambda key: start() if key == "s" else None) as has_keyboard:
         how = "s writes them" if has_keyboard else f"SIGUSR1 and the service {SNAPSHOT_SERVICE} write them"
         notify(f"keeping the last seconds in memory; {how}, Ctrl-C ends it")
-        yield
+        try:
+            yield
+        except asyncio.CancelledError as error:
+            if failed:
+                count = "1 snapshot" if len(failed) == 1 else f"{len(failed)} snapshots"
+                raise r2p.Error(f"{count} could not be written") from error
+            raise
 
 
 @contextlib.contextmanager

@@ -68,10 +68,13 @@ def _explained(path: Path) -> Iterator[None]:
 def _remarks(report: "RecoveryReport") -> Iterator[str]:
     """Say what is not in the new file."""
     if report.unreadable:
-        yield f"{report.unreadable} bytes could not be read, as it was cut off or is damaged"
+        count = report.unreadable
+        yield f"{count} byte{'s' * (count != 1)} could not be read, as it was cut off or is damaged"
     elif not report.damaged:
         yield "its end is missing; all messages that were in it are recovered"
     if report.damaged:
-        yield f"{report.damaged} damaged parts are left out"
+        yield "1 damaged part is left out" if report.damaged == 1 else f"{report.damaged} damaged parts are left out"
     if report.without_channel:
-        yield f"{report.without_channel} messages are left out, as their channel is missing in the file"
+        count = report.without_channel
+        what = "1 message is left out, as its" if count == 1 else f"{count} messages are left out, as their"
+        yield f"{what} channel is missing in the file"

@@ -34,11 +34,18 @@ class PlainTop:
         rows = sort(matching(self._view, self._view.rows(snapshot), self._wanted), self._column)
         if self._output.format == "text":
             columns = [each for each in self._view.columns if not each.extra]
-            await self._output.remark(f"{clock_text(snapshot.time)}  {self._view.name}: {len(rows)}")
+            await self._output.remark(f"{clock_text(snapshot.time)}  {_head(self._view, len(rows))}")
             await self._output.table([_texts(columns, row) for row in rows], [each.head for each in columns])
             return
         names = ["time", *(each.name for each in self._view.columns)]
         await self._output.table([{"time": snapshot.time} | _values(self._view, row) for row in rows], names)
+
+
+def _head(view: View, rows: int) -> str:
+    """Return the name of the table and the number of its rows; "buses" has one for each topic on a bus."""
+    if view.name == f"{view.columns[0].name}s":
+        return f"{view.name}: {rows}"
+    return f"{view.name}: {rows} row{'' if rows == 1 else 's'}"
 
 
 def _texts(columns: list[Column], row: Any) -> Record:

@@ -1,7 +1,8 @@
 """`r2p topic list`, `info` and `find`: what is known about topics."""
 
+import asyncio
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 import typer
@@ -12,7 +13,7 @@ from r2p.names import BUS_LOAD, BUS_SLOTS, chosen_alias, topic_name
 from r2p.tools.completion import complete_type
 from r2p.tools.options import CLASS_NAMES, Format, Wait
 from r2p.tools.output import Output, notify
-from r2p.tools.session import Session, alias_or_none
+from r2p.tools.session import Session, alias_or_none, wait_until
 from r2p.tools.topic.watching import Topic, suggest_topics
 from r2p.tools.types import Types, of_size, put_sizes, size_text
 
@@ -20,6 +21,7 @@ AllTopics = Annotated[
     bool, typer.Option("--all", "-a", help="Include the two topics of each service, NAME_q and NAME_r.")
 ]
 
+_ROUND = 5.0  # seconds in which firmware announces all that it has, one item each half second
 _COLUMNS = ["topic", "type", "size", "varies", "publishers", "subscribers"]
 
 
@@ -49,16 +51,12 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
     """
     output = Output(format)
     await session.settle(wait)
-    if wait is None and session.settings.via and not session.module.network.topics():  # all others may be busy
-        await session.look_for(lambda: bool(session.module.network.topics()))
-        await session.announcements.settled()
-    views, name = session.module.network.topics(), topic_name(topic)
-    collisions = _collisions(session, name)
-    view = views.get(name) or _with_alias(session, name, views.values())
-    if view is None and collisions:  # without its name, which is not believed, it is known as the alias
-        view = views.get(chosen_alias(name, session.settings.aliases))
+    name = topic_name(topic)
+    if wait is None and session.settings.via and _find(session, name) is None:
+        await _look_for(session, name)
+    view, collisions = _find(session, name), _collisions(session, name)
     if view is None:
-        raise r2p.Error(_unknown_text(session, name, views, collisions))
+        raise r2p.Error(_unknown_text(session, name, collisions))
     for text in dict.fromkeys(collisions.values()):
         notify(text)
     if view.mismatch:
@@ -105,12 +103,40 @@ async def find(
         raise r2p.Error(session.none_yet(f"topics of type {what}"))
 
 
-def _unknown_text(session: Session, name: str, views: Mapping[str, r2p.TopicView], collisions: dict[str, str]) -> str:
+def _find(session: Session, name: str) -> r2p.TopicView | None:
+    """Return the topic of this name or alias, if it is known."""
+    views = session.module.network.topics()
+    view = views.get(name) or _with_alias(session, name, views.values())
+    if view is None and _collisions(session, name):  # without its name, which is not believed, it is known as the alias
+        view = views.get(chosen_alias(name, session.settings.aliases))
+    return view
+
+
+async def _look_for(session: Session, name: str) -> None:
+    """Wait until a topic is known, or can be said to be missing: firmware may not have come to it, others be busy."""
+
+    def is_known() -> bool:
+        return _find(session, name) is not None
+
+    loop = asyncio.get_running_loop()
+    end = loop.time() + _ROUND
+    with session.waiting(f"topic {name}"):
+        if not await session.look_for(is_known) and session.announcements.have_firmware():
+            await wait_until(is_known, end - loop.time())
+    view = _find(session, name)
+    if view is not None and view.fingerprint is not None:  # an r2p module's, which announces more at the same time
+        await session.announcements.settled()
+
+
+def _unknown_text(session: Session, name: str, collisions: dict[str, str]) -> str:
     if name in (BUS_LOAD, BUS_SLOTS):
         return f"{name} is published only while it has a subscriber, by a module on a CAN bus: r2p topic echo {name}"
     question = suggest_topics(session, name, lambda view: True)
-    known = question or f"; known topics: {', '.join(views) or 'none'}"
+    known = question or f"; known topics: {', '.join(session.module.network.topics()) or 'none'}"
     reason = next((f"; {text}" for text in collisions.values()), known)
+    if session.announcements.have_firmware():
+        advice = "firmware announces one item every 0.5 s, so listen longer with --wait 10"
+        return f"{name} has not been announced{reason}; {advice}"
     return f"{name} has no publisher and no subscriber{reason}"
 
 

@@ -7,12 +7,18 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+import r2p
 from r2p.msg import Led
 from r2p.recording.bag import Bag
+from r2p.recording.entries import EntryWriter, MessageEntry
+from r2p.recording.messages import EVENTS, RecordedEvent
+from r2p.recording.samples import SampleWriter
+from r2p.recording.writer import BagWriter
 from r2p.tools.bag.convert import convert
 from r2p.tools.bag.times import moment
 from r2p.tools.session import UsageError
 from tests.recording.convert.samples import START, record
+from tests.recording.making import damage, leds
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,3 +61,30 @@ async def test_types_of_the_settings_count_for_tables(
 async def test_a_time_outside_of_the_recording(recording: Path) -> None:
     with pytest.raises(UsageError, match="--start 1h is after the end: the recording is from"):
         await convert(recording, recording.with_suffix(".bag"), start=moment("1h"))
+
+
+@pytest.mark.anyio
+async def test_a_damaged_chunk_is_counted_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "drive.mcap"
+    with path.open("wb") as file:
+        writer = BagWriter(file)
+        topics, others = SampleWriter(writer), EntryWriter(writer)
+        for topic, sample, cls, log_time in leds(2):
+            topics.write(topic, sample, cls, log_time)
+            others.write(MessageEntry(EVENTS, RecordedEvent("link up"), log_time))
+            writer.end_chunk()
+        writer.finish()
+    await convert(damage(path), tmp_path / "new.mcap", format="json")
+    lost = json.loads(capsys.readouterr().out)["lost"]
+    assert lost == {"chunks of the file that can't be read, with the messages there": 1}
+
+
+@pytest.mark.anyio
+async def test_what_can_not_be_written_or_read_is_no_wrong_use(recording: Path, tmp_path: Path) -> None:
+    target = tmp_path / f"{'x' * 250}.csv"  # the name of the unfinished file is too long
+    with pytest.raises(r2p.Error, match=r"can't write .*x\.csv: File name too long"):
+        await convert(recording, target, topics=["t_r2p_msgs_led"])
+    (tmp_path / "leds.csv").mkdir()
+    (tmp_path / "leds.csv" / "a.csv").mkdir()
+    with pytest.raises(r2p.Error, match=r"can't read .*a\.csv: Is a directory"):
+        await convert(tmp_path / "leds.csv", tmp_path / "new.mcap", type=["a=Led"])

@@ -8,7 +8,7 @@ import pytest
 from r2p.tools.bag.edit import cut, merge
 from r2p.tools.bag.times import moment
 from r2p.tools.session import UsageError
-from tests.recording.making import MS, T0, leds, of, read, write
+from tests.recording.making import MS, T0, damage, leds, of, read, write
 
 pytestmark = pytest.mark.anyio
 
@@ -40,6 +40,17 @@ async def test_cut(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(UsageError, match="--start 2s is after the end"):
         await cut(path, output=tmp_path / "b.mcap", start=moment("2s"))
     assert not (tmp_path / "b.mcap").exists()
+
+
+async def test_cut_says_what_is_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = damage(write(tmp_path / "drive.mcap", leds(30)), 2), tmp_path / "out.mcap"
+    await cut(path, output=out)
+    printed = capsys.readouterr()
+    assert f"1 chunk could not be read, and is missing in {out}" in printed.err
+    assert json.loads(printed.out)["messages"] == len(read(out)) < 30
+    damage(path, 4)
+    await cut(path, output=tmp_path / "again.mcap")
+    assert "2 chunks could not be read, and are missing in" in capsys.readouterr().err
 
 
 async def test_merge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

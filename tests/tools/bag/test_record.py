@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import typer
 
+import r2p
 from r2p.codecs.can_bits import Frame
 from r2p.errors import TransportError
 from r2p.msg import Led
@@ -27,8 +28,6 @@ from tests.tools.rig import PUBLISH, VIA, listening, printed, process, robot, to
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
-
-    import r2p
 
 GIVEN: dict[str, Any] = {
     **dict.fromkeys(("topics", "exclude", "type", "output", "max_size", "max_duration", "max_total", "min_free")),
@@ -137,6 +136,40 @@ async def test_a_service_writes_the_last_seconds(tmp_path: Path) -> None:
         await asyncio.sleep(2.0)
     assert answers == [Trigger.Response(success=True, message=f"{tmp_path}/last-0001.mcap")]
     assert 8 <= len(values(tmp_path / "last-0001.mcap")) <= 20
+
+
+@pytest.mark.virtual_time
+async def test_a_place_for_snapshots_that_can_not_be_written_is_said_at_once(tmp_path: Path) -> None:
+    path = tmp_path / f"{'x' * 250}.mcap"  # the names of snapshots are longer
+    async with robot(leds), tool() as session, asyncio.timeout(5.0):
+        with pytest.raises(r2p.Error, match=r"can't write .*x\.mcap: File name too long"):
+            await record(session, all=True, output=path, snapshot=1.0)
+    assert not list(tmp_path.iterdir())  # noqa: ASYNC240
+
+
+@pytest.mark.virtual_time
+async def test_a_snapshot_that_can_not_be_written_ends_in_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "place" / "last.mcap"
+    path.parent.mkdir()
+    answers: list[Trigger.Response] = []
+
+    async def ask(node: r2p.Node) -> None:
+        answers.append(await node.client(SNAPSHOT_SERVICE, Trigger).call(Trigger.Request(), timeout=5.0))
+
+    async with robot(leds) as bot, tool() as session:
+        task = asyncio.create_task(record(session, all=True, output=path, snapshot=1.0))
+        await asyncio.sleep(3.0)
+        path.parent.rmdir()
+        bot.start(ask)
+        await asyncio.sleep(2.0)
+        task.cancel()
+        with pytest.raises(r2p.Error, match="1 snapshot could not be written"):
+            await task
+    why = f"can't write {path.parent}/last-0001.mcap: No such file or directory"
+    assert answers == [Trigger.Response(success=False, message=why[-160:])]
+    assert f"no snapshot: {why}; the last seconds are still kept: try again" in capsys.readouterr().err
 
 
 @pytest.fixture

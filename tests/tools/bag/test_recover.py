@@ -8,6 +8,7 @@ from r2p.errors import BagError
 from r2p.tools.bag.recover import recover
 from r2p.tools.session import UsageError
 from tests.recording.checker import check
+from tests.recording.making import damage
 from tests.recording.test_recovery import BAG, CHUNKS, COUNT
 from tests.tools.rig import printed
 
@@ -51,6 +52,13 @@ async def test_stderr_says_what_is_missing(cut: Path, capsys: pytest.CaptureFixt
     assert "is complete: there is nothing to recover" in capsys.readouterr().err
     assert not cut.with_name("whole.mcap").exists()
     assert len(check(cut)) == COUNT
+
+
+async def test_what_is_left_out_is_counted(cut: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cut.write_bytes(BAG)  # noqa: ASYNC240
+    for number, text in enumerate(("1 damaged part is left out", "2 damaged parts are left out")):
+        await recover(damage(cut, number), output=cut.with_name(f"{number}.mcap"))
+        assert text in capsys.readouterr().err
 
 
 async def test_what_can_not_be_done_is_said(cut: Path) -> None:

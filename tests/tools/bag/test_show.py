@@ -22,11 +22,12 @@ from r2p.recording.messages import (
 )
 from r2p.recording.writer import BagWriter
 from r2p.tools import main
+from r2p.tools.bag.attachment import attachment
 from r2p.tools.bag.echo import echo
 from r2p.tools.bag.info import info
 from r2p.tools.bag.times import moment
 from r2p.tools.session import UsageError
-from tests.recording.making import MS, T0, led, leds, write
+from tests.recording.making import MS, T0, damage, led, leds, write
 
 
 @pytest.fixture
@@ -139,6 +140,20 @@ async def test_info_has_losses_by_cause(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.anyio
+async def test_info_of_all_finds_damaged_chunks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = damage(write(tmp_path / "drive.mcap", leds(99)), 5)
+    await info(path, all=True)
+    assert printed(capsys)[0]["damaged_chunks"] == 1
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    await info(path, all=True)
+    assert "damaged      1 chunk, whose messages can't be read" in capsys.readouterr().out
+    await info(damage(path, 7), all=True)
+    assert "damaged      2 chunks, whose messages can't be read" in capsys.readouterr().out
+
+
+@pytest.mark.anyio
 async def test_info_of_a_file_that_is_being_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "drive.mcap", leds(9), finish=False)
     await info(path)
@@ -196,6 +211,13 @@ async def test_echo_as_csv_has_one_header_for_all_topics(tmp_path: Path, capsys:
     assert lines[0] == "topic,led,value,_.topic,_.stamp,_.stamp_from,_.source,_.sequence,data,_.received"
     assert lines[1].startswith("raw,,,raw,")
     assert lines[1].endswith(f",4,0400000001,{T0}")
+
+
+@pytest.mark.anyio
+async def test_an_attachment_that_can_not_be_written_is_no_wrong_use(tmp_path: Path) -> None:
+    path = write(tmp_path / "drive.mcap", leds(1))
+    with pytest.raises(r2p.Error, match=r"can't write .*nowhere/r2p\.toml: No such file or directory"):
+        await attachment(path, "r2p.toml", target=tmp_path / "nowhere" / "r2p.toml")
 
 
 def test_the_list_of_commands_says_of_each_what_its_own_help_says() -> None:

@@ -79,7 +79,7 @@ async def test_each_table_is_printed_at_a_terminal(view: str) -> None:
     await PlainTop(Output("text", terminal), VIEWS[view]).put(network())
     lines = terminal.getvalue().splitlines()
     rows = VIEWS[view].rows(network())
-    assert lines[0].endswith(f"  {view}: {len(rows)}")
+    assert lines[0].endswith(f"  {view}: {len(rows)}" + (" row" if view == "buses" else ""))
     assert len(lines) >= 2 + len(rows)
     names = {VIEWS[view].columns[0].text(row) for row in rows}
     assert all(any(line.startswith(name) for line in lines[2:]) for name in names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import re
 from typing import Annotated, Any
@@ -237,6 +238,35 @@ async def test_info_waits_for_the_only_module_if_that_is_late(capsys: pytest.Cap
         async with robot():
             await showing
     assert printed(capsys)[0]["topic"] == "log"
+
+
+def late_firmware() -> None:
+    """Firmware that comes to one of its topics after three seconds."""
+    imu = Firmware()
+    imu.alive()
+    imu.advertise("gyro", 12)
+    asyncio.get_running_loop().call_later(3.2, imu.advertise, "imu", 26)
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("nodes", [[], [blink]])
+async def test_info_waits_for_firmware_to_come_to_the_topic_and_no_longer(
+    nodes: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        if nodes:
+            await stack.enter_async_context(robot(*nodes))
+        session = await stack.enter_async_context(tool())
+        loop, start = asyncio.get_running_loop(), asyncio.get_running_loop().time()
+        late_firmware()
+        await info(session, "imu")
+        assert loop.time() - start == pytest.approx(3.2, abs=0.1)
+        (details,) = printed(capsys)
+        assert (details["topic"], details["size"]) == ("imu", 26)
+        start = loop.time()
+        with pytest.raises(r2p.Error, match=r"^mag has not been announced; .*: gyro.*listen longer with --wait 10$"):
+            await info(session, "mag")
+        assert 5.0 < loop.time() - start < 7.0
 
 
 @pytest.mark.virtual_time
