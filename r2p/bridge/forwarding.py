@@ -6,7 +6,7 @@
 them are in use, and the result is kept for the next ones. So forwarding is one loop over a list, and a change costs as
 much as the routes that it concerns. For each message the clock is read to see whether both ports may still forward: a
 gateway that was stopped must not go on with an old tree. Messages that arrive while the gateway listens anew are held,
-and forwarded if it may forward afterwards.
+and forwarded if it may forward afterwards. So are those for a link that has a new subscriber and can't serve it yet.
 """
 
 import asyncio
@@ -32,14 +32,14 @@ HOPS_MAX = 15
 """Gateways on a message's way, at most: the last defence against loops where messages carry hops."""
 
 HELD_MAX = 4096
-"""Places for held messages."""
+"""Places for messages that are held for one reason."""
 
 READY = SECOND
 """For how long messages wait for a link to serve a new subscriber (ns)."""
 
 _NOT_SUBSCRIBED = "not subscribed"
 _PLACE = 16 * 1024
-"""Bytes of a message in each place: so held messages have 64 MiB at most, and one message more."""
+"""Bytes of a message in each place: so these messages have 64 MiB at most, and one message more."""
 
 
 class BridgePort:
@@ -208,7 +208,7 @@ class BridgedTopic(Topic):
         now = self._monotonic()
         port = self._ports[link]
         if now >= port.tree_port.forwards_until:
-            if not self._hold(port, sample, functools.partial(self._deliver_held, port, sample)):
+            if not self._hold_in_pause(port, sample, functools.partial(self._deliver_held, port, sample)):
                 port.count_dropped("converging")
             return None
         # A latched value arrives again, unchanged, for each new subscriber.
@@ -232,7 +232,7 @@ class BridgedTopic(Topic):
         """Queue nothing in bulk: each message is looked at, and forwarded."""
         return 0
 
-    def _hold(self, port: BridgePort, sample: Sample, go_on: Callable[[], list[Sink] | None]) -> bool:
+    def _hold_in_pause(self, port: BridgePort, sample: Sample, go_on: Callable[[], list[Sink] | None]) -> bool:
         """Hold a message while its port pauses; return False if it does not, or if the message is of no use later."""
         non_real_time = sample.publisher_class == PublisherClass.NON_REAL_TIME
         return non_real_time and port.resumes and self._held.hold(sample, go_on)
@@ -249,7 +249,7 @@ class BridgedTopic(Topic):
             self._await_subscriber(route, sample, now)
             return blocked
         if now >= port.tree_port.forwards_until:
-            if not self._hold(port, sample, functools.partial(self._forward_held, route, sample)):
+            if not self._hold_in_pause(port, sample, functools.partial(self._forward_held, route, sample)):
                 route.dropped["converging"] += 1
                 port.link.stats.lost["converging"] += 1
             return blocked
@@ -269,7 +269,10 @@ class BridgedTopic(Topic):
         return blocked
 
     def _await_subscriber(self, route: Route, sample: Sample, now: int) -> None:
-        """Hold a message for a link that will soon serve its new subscriber; drop it if there is none."""
+        """Hold a message until the link can serve its new subscriber.
+
+        The message is dropped, and counted, if too many are held already, or if the link takes too long.
+        """
         if route.held is None and now < route.ready_by and self.relayed is not None:
             route.held = HeldMessages()
             self.relayed.holding[route] = None
@@ -293,7 +296,7 @@ class BridgedTopic(Topic):
         silent = [each for each in subscribers if now >= self._ports[each.link_name].tree_port.forwards_until]
         for each in silent:
             port = self._ports[each.link_name]
-            if not self._hold(port, sample, functools.partial(self._send_held, each, sample)):
+            if not self._hold_in_pause(port, sample, functools.partial(self._send_held, each, sample)):
                 each.lost += 1
                 port.count_dropped("converging")
         if silent:
@@ -438,6 +441,8 @@ class RelayedTopic:
 
     def release_held(self, topic: BridgedTopic, subscriber: RemoteSubscriber) -> None:
         """Forward what waited for a link that has joined the topic, but for values that it will get as latched ones."""
+        if not self.holding:
+            return
         latched = [sample for each in self.topics.values() for sample in each.latched_values()]
         for route in list(self.holding):
             if route.target is topic and route.port.link is subscriber.link and route.held is not None:

@@ -76,10 +76,12 @@ class Outlet(SporadicPublisher[Any]):
         sample = DirectedSample(
             data, self._source, stamp, stamp + lifetime, sequence, PublisherClass.SPORADIC, to=caller
         )
-        if link and not self._topic.remote_subscribers:
+        others = self._topic.remote_subscribers
+        if link and all(each.link_name != link for each in others):
             self._early.append((link, sample))
-        else:
-            self._deliver_by(link, sample, lifetime)
+            if not others:
+                return
+        self._deliver_by(link, sample, lifetime)
 
     def _deliver_by(self, link: str, sample: Sample, lifetime: int) -> None:
         blocked = self._topic.deliver_by(link, sample)

@@ -234,7 +234,7 @@ class Backlog(ReceiveBackpressure, Generic[P]):
             self._count(samples[1:], 1)
 
     def append(self, publisher: P, serial: int, samples: list[Sample] | None) -> bool:
-        """Append messages, or return False if there is no room.
+        """Append messages. Return False if there is no room for them.
 
         `samples` is None for a single message that only has to be acknowledged in its turn.
         """

@@ -355,3 +355,7 @@ async def test_an_answer_waits_until_its_link_knows_of_its_caller(server: r2p.No
     assert (one.got, other.got) == ([], [b"fresh"])
     outlet.answer(b"later", SECOND, "b", 2)
     assert one.got == [b"later"]
+    outlet.answer(b"beside others", SECOND, "c", 3)
+    third = Line("c")
+    outlet.where.join(third)
+    assert third.got == [b"beside others"]

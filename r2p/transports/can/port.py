@@ -194,7 +194,7 @@ B = TypeVar("B", bound=OpenInterface)
 
 
 class InterfacePort(CanPort, Generic[B]):
-    """A port whose interface may disappear and come back. Meanwhile `_bus` is None, and frames are lost."""
+    """A port whose interface may disappear and come back. While it is away, `_bus` is None and frames are lost."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name)

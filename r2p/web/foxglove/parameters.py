@@ -115,7 +115,7 @@ class NetworkParameters:
         return problems
 
     def _unknown(self, name: str) -> str:
-        """Return why there is no parameter to set."""
+        """Return the error message for a parameter that could not be found."""
         reason = next((text for module, text in self._silent.items() if _is_of(module, [name])), "")
         return f"{name} is not set: {reason}" if reason else f"there is no parameter {name}"
 

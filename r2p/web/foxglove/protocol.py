@@ -299,7 +299,7 @@ def status(level: StatusLevel, message: str, id: str | None = None) -> str:
 
 
 def remove_status(ids: Iterable[str]) -> str:
-    """Encode that texts do not hold any more."""
+    """Return the JSON that removes the status messages with these ids."""
     return _json("removeStatus", statusIds=list(ids))
 
 

@@ -57,7 +57,7 @@ class ServiceTable:
         self._numbers = 0
 
     def review(self, views: Mapping[str, TopicView]) -> None:
-        """Add the services that have a server, and remove those that have none any more."""
+        """Add services that now have a server, and remove services whose last server has gone."""
         topics = [name for name in views if name.endswith(REQUESTS) and is_of_service(name, views)]
         self._wanted = {name.removesuffix(REQUESTS) for name in topics if self._is_served(views[name])}
         self._named.intersection_update(views)

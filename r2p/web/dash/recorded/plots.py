@@ -256,7 +256,7 @@ class MinMaxSteps:
 
 
 def _ends(values: Sequence[float]) -> tuple[float, float]:
-    """Return the smallest and the largest value, in the order in which they occur; NaN for both if there is none."""
+    """Return the minimum and the maximum in the order in which they occur, or NaN twice if there are no numbers."""
     least, greatest = min(values), max(values)
     if not (least <= greatest and math.isfinite(greatest - least)):  # NaN is neither less nor greater
         numbers = [each for each in values if each == each]
